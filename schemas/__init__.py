@@ -1,0 +1,1 @@
+"""The messages that flow between the stages: dataclasses, their protobuf schemas, topics and codec."""
