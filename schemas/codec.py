@@ -5,8 +5,11 @@ probabilities make sense. Whatever is wrong raises `CodecError` with the field's
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import cache, lru_cache
+from itertools import accumulate, islice
 from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
@@ -30,6 +33,7 @@ from schemas.messages import (
 )
 
 T = TypeVar("T")
+Descriptor = Any  # protobuf has one class of descriptors per backend
 PACKAGE = "pcgan.v1"
 
 
@@ -39,7 +43,11 @@ class CodecError(ValueError):
 
 def encode(message: object) -> bytes:
     """Returns the protobuf bytes of a message dataclass; the same message always gives the same bytes."""
-    return to_protobuf(message).SerializeToString(deterministic=True)
+    data = _encoded.get(message) if type(message) in _SENT_TWICE else None
+    if data is None:
+        data = bytes(to_protobuf(message).SerializeToString(deterministic=True))
+        _remember(message, data)
+    return data
 
 
 def to_protobuf(message: object) -> Message:
@@ -59,6 +67,7 @@ def decode(message_type: type[T], data: bytes) -> T:
     except DecodeError as error:
         raise CodecError(f"not a {PACKAGE}.{message_type.__name__}: {error}") from error
     decoded: T = decoder(message)
+    _remember(decoded, data)
     return decoded
 
 
@@ -74,10 +83,20 @@ def protobuf_type(message_type: type) -> type[Message]:
     return generated
 
 
+# A track frame goes to the predictor and to the log, its answer from the predictor to the log: both are encoded once.
+_SENT_TWICE = (TrackFrame, PredictionFrame)
+_encoded: WeakKeyDictionary[object, bytes] = WeakKeyDictionary()
+
+
+def _remember(message: object, data: bytes) -> None:
+    if type(message) in _SENT_TWICE:
+        _encoded[message] = data
+
+
 # --- packed arrays -------------------------------------------------------------------------------------------------
 
 _FIELD = FieldDescriptor
-_PACKED_DTYPES = {
+_PACKED_DTYPES: dict[int, np.dtype[Any]] = {
     _FIELD.TYPE_DOUBLE: np.dtype("<f8"),
     _FIELD.TYPE_FLOAT: np.dtype("<f4"),
     _FIELD.TYPE_FIXED64: np.dtype("<u8"),
@@ -85,7 +104,7 @@ _PACKED_DTYPES = {
     _FIELD.TYPE_SFIXED64: np.dtype("<i8"),
     _FIELD.TYPE_BOOL: np.dtype("<u1"),
 }
-_LENGTH_DELIMITED = 2  # protobuf wire type
+_FIXED64, _LENGTH_DELIMITED = 1, 2  # protobuf wire types
 
 
 def _set_arrays(message: Message, **arrays: ArrayLike) -> None:
@@ -94,15 +113,22 @@ def _set_arrays(message: Message, **arrays: ArrayLike) -> None:
     A packed field on the wire is a tag, a length and the little-endian numbers, so an array's own bytes are merged in.
     `extend(array.tolist())` gives the same bytes and is 100 times slower.
     """
-    wire = bytearray()
+    wire: list[bytes] = []
     for name, values in arrays.items():
-        field = message.DESCRIPTOR.fields_by_name[name]
-        data = np.ascontiguousarray(np.asarray(values), _PACKED_DTYPES[field.type]).tobytes()
+        number, dtype = _number_and_dtype(message.DESCRIPTOR, name)
+        data = np.asarray(values, dtype).tobytes()
         if data:
-            wire += _varint(field.number << 3 | _LENGTH_DELIMITED) + _varint(len(data)) + data
-    message.MergeFromString(bytes(wire))
+            wire += (_varint(number << 3 | _LENGTH_DELIMITED), _varint(len(data)), data)
+    message.MergeFromString(b"".join(wire))
 
 
+@cache
+def _number_and_dtype(descriptor: Descriptor, name: str) -> tuple[int, np.dtype[Any]]:
+    field = descriptor.fields_by_name[name]
+    return field.number, _PACKED_DTYPES[field.type]
+
+
+@lru_cache(maxsize=1024)
 def _varint(value: int) -> bytes:
     out = bytearray()
     while value > 0x7F:
@@ -112,18 +138,85 @@ def _varint(value: int) -> bytes:
     return bytes(out)
 
 
-def _columns(message: Message, *names: str) -> NDArray[Any]:
-    """Returns parallel packed fields as columns (N, len(names)); raises CodecError unless equally long and finite."""
-    arrays = [np.array(getattr(message, name)) for name in names]
-    lengths = {len(array) for array in arrays}
-    if len(lengths) > 1:
-        found = ", ".join(f"{name} {len(array)}" for name, array in zip(names, arrays, strict=True))
+def _columns(message: Message, *names: str) -> NDArray[np.float64]:
+    """Returns a message's parallel repeated fields as columns (N, len(names)), for messages of a few objects.
+
+    Raises CodecError unless they are equally long and finite.
+    """
+    fields = [getattr(message, name)[:] for name in names]
+    if len(set(map(len, fields))) > 1:
+        found = ", ".join(f"{name} {len(field)}" for name, field in zip(names, fields, strict=True))
         raise CodecError(f"{message.DESCRIPTOR.name} arrays differ in length: {found}")
-    columns = np.column_stack(arrays)
-    if not np.isfinite(columns).all():
-        bad = next(name for name, array in zip(names, arrays, strict=True) if not np.isfinite(array).all())
-        raise CodecError(f"{message.DESCRIPTOR.name}.{bad} holds NaN or infinity")
-    return columns
+    rows = np.array(fields, float)
+    _check_finite(rows, message.DESCRIPTOR, names)
+    return rows.T
+
+
+def _check_finite(rows: NDArray[Any], descriptor: Descriptor, names: Sequence[str]) -> None:
+    """Raises CodecError naming the first of the rows that holds NaN or infinity."""
+    if not math.isfinite(rows.sum(dtype=float)):  # one pass; no sum of finite float32s or coordinates overflows
+        for name, row in zip(names, rows, strict=True):
+            if not np.isfinite(row).all():
+                raise CodecError(f"{descriptor.name}.{name} holds NaN or infinity")
+
+
+def _table(
+    descriptor: Descriptor, wires: Sequence[dict[int, bytes]], names: Sequence[str]
+) -> tuple[NDArray[Any], list[int]]:
+    """Returns the parallel packed fields of several messages of one type, one behind the other, and their lengths.
+
+    All at once, since a frame has hundreds of short arrays: (len(names), sum of lengths). Raises CodecError unless the
+    arrays of each message are equally long and everything is finite.
+    """
+    rows, lengths = [], []
+    for name in names:
+        number, dtype = _number_and_dtype(descriptor, name)
+        parts = [wire.get(number, b"") for wire in wires]
+        rows.append(np.frombuffer(b"".join(parts), dtype))
+        lengths.append([len(part) // dtype.itemsize for part in parts])
+    for field_lengths in lengths[1:]:
+        if field_lengths != lengths[0]:
+            row = next(i for i, length in enumerate(field_lengths) if length != lengths[0][i])
+            found = ", ".join(f"{name} {field[row]}" for name, field in zip(names, lengths, strict=True))
+            raise CodecError(f"{descriptor.name} arrays differ in length: {found}")
+    table = np.array(rows)
+    _check_finite(table, descriptor, names)
+    return table, lengths[0]
+
+
+def _packed_fields(data: bytes) -> dict[int, bytes]:
+    """Returns the bytes of a message's packed fields and singular sub-messages by field number.
+
+    `data` is protobuf's own serialisation, in which each packed field stands once, whatever the sender wrote: reading
+    it off is several times faster than converting repeated fields one by one. Tags have one byte, as all our field
+    numbers are below 16.
+    """
+    fields = {}
+    at, end = 0, len(data)
+    while at < end:
+        number, wire_type = data[at] >> 3, data[at] & 7
+        at += 1
+        if wire_type == _FIXED64:
+            at += 8
+            continue
+        value = shift = 0
+        while True:  # a varint: the value itself, or the length of what follows
+            byte = data[at]
+            at += 1
+            value |= (byte & 0x7F) << shift
+            if byte < 0x80:
+                break
+            shift += 7
+        if wire_type == _LENGTH_DELIMITED:
+            fields[number] = data[at : at + value]
+            at += value
+    return fields
+
+
+def _split(array: NDArray[Any], lengths: Sequence[int]) -> list[NDArray[Any]]:
+    """Cuts an array along its first axis into pieces of the given lengths."""
+    ends = list(accumulate(lengths))
+    return [array[end - length : end] for end, length in zip(ends, lengths, strict=True)]
 
 
 def _require(condition: bool, message: Message, problem: str) -> None:
@@ -132,9 +225,10 @@ def _require(condition: bool, message: Message, problem: str) -> None:
 
 
 def _check_scalars(message: Message, *names: str) -> None:
-    for name in names:
-        if not math.isfinite(getattr(message, name)):
-            raise CodecError(f"{message.DESCRIPTOR.name}.{name} is not finite")
+    values = [getattr(message, name) for name in names]
+    if not math.isfinite(sum(values)):
+        for name, value in zip(names, values, strict=True):
+            _require(math.isfinite(value), message, f"{name} is not finite")
 
 
 def _check_stamp(message: Message) -> None:
@@ -154,10 +248,11 @@ def _encode_detections(detections: CameraDetections) -> Message:
 def _decode_detections(message: pb.CameraDetections) -> CameraDetections:
     _check_stamp(message)
     columns = _columns(message, "x_min", "y_min", "x_max", "y_max", "score")
-    boxes, scores = columns[:, :4].astype(float), columns[:, 4].astype(float)
+    boxes, scores = columns[:, :4], columns[:, 4]
     _require(len(message.label) == len(boxes), message, f"has {len(boxes)} boxes but {len(message.label)} labels")
-    _require(bool((boxes[:, 2:] >= boxes[:, :2]).all()), message, "has a box of negative size")
-    _require(bool(((scores >= 0) & (scores <= 1)).all()), message, "has a score outside 0 to 1")
+    if len(boxes):
+        _require(bool((boxes[:, 2:] >= boxes[:, :2]).all()), message, "has a box of negative size")
+        _require(scores.min() >= 0 and scores.max() <= 1, message, "has a score outside 0 to 1")
     return CameraDetections(message.stamp_ns, message.frame_id, boxes, scores, tuple(message.label))
 
 
@@ -171,7 +266,7 @@ def _encode_clusters(clusters: LidarClusters) -> Message:
 
 def _decode_clusters(message: pb.LidarClusters) -> LidarClusters:
     _check_stamp(message)
-    columns = _columns(message, "x", "y", "z", "size_x", "size_y", "size_z").astype(float)
+    columns = _columns(message, "x", "y", "z", "size_x", "size_y", "size_z")
     points = np.array(message.points, np.int64)
     _require(len(points) == len(columns), message, f"has {len(columns)} clusters but {len(points)} point counts")
     _require(bool((columns[:, 3:] >= 0).all()), message, "has a cluster of negative size")
@@ -201,7 +296,7 @@ def _decode_pose(message: pb.VehiclePose) -> VehiclePose:
 def unit_quaternion(xyzw: ArrayLike) -> NDArray[np.float64]:
     """Returns a logged quaternion (4,) at length 1; raises CodecError if it is not near that already."""
     quaternion = np.asarray(xyzw, float)
-    norm = float(np.linalg.norm(quaternion))
+    norm = math.sqrt(float(quaternion @ quaternion))
     if not abs(norm - 1) < 0.05:
         raise CodecError(f"a rotation's quaternion {quaternion.tolist()} has length {norm:.3g} instead of 1")
     return quaternion / norm
@@ -251,39 +346,67 @@ def _encode_track_frame(frame: TrackFrame) -> Message:
 def _decode_track_frame(message: pb.TrackFrame) -> TrackFrame:
     _check_stamp(message)
     vehicle = message.vehicle_history
-    states = _columns(vehicle, "x", "y", "yaw", "vx", "vy")
-    history = VehicleHistory(_stamps(vehicle, len(states)), states)
-    tracks = tuple(_decode_track(track) for track in message.tracks)
-    _require(len({track.id for track in tracks}) == len(tracks), message, "has two tracks of one id")
+    wires = [_packed_fields(vehicle.SerializeToString())]
+    states, lengths = _table(vehicle.DESCRIPTOR, wires, ("x", "y", "yaw", "vx", "vy"))
+    vehicle_history = VehicleHistory(_rising_stamps(vehicle.DESCRIPTOR, wires, lengths), states.T)
+    tracks = message.tracks
+    ids = {track.id for track in tracks}
+    _require(len(ids) == len(tracks), message, "has two tracks of one id")
     return TrackFrame(
-        message.sequence, message.stamp_ns, message.frame_id, history, tracks, message.pose_extrapolated, message.epoch
+        message.sequence,
+        message.stamp_ns,
+        message.frame_id,
+        vehicle_history,
+        _decode_tracks(tracks) if tracks else (),
+        message.pose_extrapolated,
+        message.epoch,
     )
 
 
-def _decode_track(message: pb.Track) -> Track:
-    _check_scalars(message, "x", "y", "vx", "vy", "existence")
-    _require(0 <= message.existence <= 1, message, f"existence {message.existence} is outside 0 to 1")
-    covariance = _columns(message, "covariance")
-    _require(len(covariance) == 16, message, f"covariance has {len(covariance)} entries instead of 16")
-    states = _columns(message.history, "x", "y", "vx", "vy")
-    coasting = np.array(message.history.coasting, bool)
-    _require(len(coasting) == len(states), message.history, "arrays differ in length")
-    return Track(
-        message.id,
-        np.array([message.x, message.y, message.vx, message.vy]),
-        covariance.reshape(4, 4),
-        message.existence,
-        message.age_ns,
-        message.coasting,
-        TrackHistory(_stamps(message.history, len(states)), states, coasting),
+def _decode_tracks(tracks: Sequence[pb.Track]) -> tuple[Track, ...]:
+    present = np.array([(track.x, track.y, track.vx, track.vy, track.existence) for track in tracks])
+    if not np.isfinite(present).all():
+        bad = int(np.flatnonzero(~np.isfinite(present).all(axis=0))[0])
+        raise CodecError(f"Track.{('x', 'y', 'vx', 'vy', 'existence')[bad]} is not finite")
+    outside = np.flatnonzero((present[:, 4] < 0) | (present[:, 4] > 1))
+    _require(len(outside) == 0, tracks[0], f"existence {present[outside[:1], 4]} is outside 0 to 1")
+    wires = [_packed_fields(track.SerializeToString()) for track in tracks]
+    covariances, sizes = _table(pb.Track.DESCRIPTOR, wires, ("covariance",))
+    _require(set(sizes) == {16}, tracks[0], f"covariance has {max(sizes, key=lambda n: n != 16)} entries instead of 16")
+    past_wires = [_packed_fields(wire.get(_HISTORY, b"")) for wire in wires]
+    states, lengths = _table(pb.TrackHistory.DESCRIPTOR, past_wires, ("x", "y", "vx", "vy"))
+    stamps_ns = _rising_stamps(pb.TrackHistory.DESCRIPTOR, past_wires, lengths)
+    coasting, flags = _table(pb.TrackHistory.DESCRIPTOR, past_wires, ("coasting",))
+    _require(flags == lengths, tracks[0].history, "arrays differ in length")
+    past = map(
+        TrackHistory,
+        _split(stamps_ns, lengths),
+        _split(np.ascontiguousarray(states.T), lengths),
+        _split(coasting[0].astype(bool), lengths),
+    )
+    return tuple(
+        Track(track.id, state, covariance, existence, track.age_ns, track.coasting, history)
+        for track, state, covariance, existence, history in zip(
+            tracks, present[:, :4], covariances.reshape(-1, 4, 4), present[:, 4].tolist(), past, strict=True
+        )
     )
 
 
-def _stamps(history: Message, count: int) -> NDArray[np.int64]:
-    stamps = np.array(history.stamp_ns, np.int64)  # type: ignore[attr-defined]
-    _require(len(stamps) == count, history, f"has {count} states but {len(stamps)} stamps")
-    _require(bool((np.diff(stamps) > 0).all()), history, "stamps do not rise")
-    return stamps
+_HISTORY = pb.Track.DESCRIPTOR.fields_by_name["history"].number
+
+
+def _rising_stamps(descriptor: Descriptor, wires: Sequence[dict[int, bytes]], lengths: list[int]) -> NDArray[np.int64]:
+    """Returns all histories' stamps one behind the other; raises CodecError unless each one's rise."""
+    (stamps_ns,), found = _table(descriptor, wires, ("stamp_ns",))
+    for stamps_found, length in zip(found, lengths, strict=True):
+        if stamps_found != length:
+            raise CodecError(f"{descriptor.name} has {length} states but {stamps_found} stamps")
+    rises = np.diff(stamps_ns) > 0
+    ends = np.cumsum(lengths)[:-1]
+    rises[ends[(ends > 0) & (ends < len(stamps_ns))] - 1] = True  # from one history to the next
+    if not rises.all():
+        raise CodecError(f"{descriptor.name} stamps do not rise")
+    return np.asarray(stamps_ns, np.int64)
 
 
 # --- predictions ---------------------------------------------------------------------------------------------------
@@ -315,30 +438,54 @@ def _encode_prediction_frame(frame: PredictionFrame) -> Message:
 def _decode_prediction_frame(message: pb.PredictionFrame) -> PredictionFrame:
     _check_stamp(message)
     _require(message.dt_s > 0 and math.isfinite(message.dt_s), message, f"dt_s {message.dt_s} is not positive")
-    predictions = tuple(_decode_prediction(prediction) for prediction in message.predictions)
+    predictions = _decode_predictions(message.predictions) if message.predictions else ()
     return PredictionFrame(
         message.sequence, message.stamp_ns, message.frame_id, message.model, message.dt_s, predictions
     )
 
 
-def _decode_prediction(message: pb.Prediction) -> Prediction:
-    _require(len(message.paths) > 0, message, "has no path")
-    paths = []
-    for path in message.paths:
+def _decode_predictions(predictions: Sequence[pb.Prediction]) -> tuple[Prediction, ...]:
+    paths = [path for prediction in predictions for path in prediction.paths]
+    counts = [len(prediction.paths) for prediction in predictions]
+    _require(0 not in counts, predictions[0], "has no path")
+    for path in paths:
         _require(0 <= path.probability <= 1, path, f"probability {path.probability} is outside 0 to 1")
-        paths.append(ModalPath(path.probability, _columns(path, "x", "y")))
-    steps = len(paths[0].points_m)
-    mixture, K = message.mixture, message.mixture.components
-    columns = _columns(mixture, "weight", "x", "y", "sigma_x", "sigma_y", "rho")
-    _require(K > 0 and len(columns) == steps * K, mixture, f"has {len(columns)} components for {steps} steps of {K}")
-    weights, x, y, sigma_x, sigma_y, rhos = columns.T.reshape(6, steps, K)
-    _require(bool((sigma_x > 0).all() and (sigma_y > 0).all()), mixture, "has a sigma that is not positive")
-    return Prediction(
-        message.track_id,
-        message.fallback,
-        tuple(paths),
-        Mixture(weights, np.stack([x, y], -1), np.stack([sigma_x, sigma_y], -1), rhos),
+    wires = [_packed_fields(path.SerializeToString()) for path in paths]
+    points, lengths = _table(pb.ModalPath.DESCRIPTOR, wires, ("x", "y"))
+    modal_paths = iter(
+        [
+            ModalPath(path.probability, path_points)
+            for path, path_points in zip(paths, _split(np.ascontiguousarray(points.T), lengths), strict=True)
+        ]
     )
+    mixtures = _decode_mixtures([prediction.mixture for prediction in predictions])
+    decoded = []
+    for prediction, count, mixture in zip(predictions, counts, mixtures, strict=True):
+        tree = tuple(islice(modal_paths, count))
+        steps = len(mixture.weights)
+        _require(
+            all(len(path.points_m) == steps for path in tree), prediction, f"has a path that is not {steps} steps long"
+        )
+        decoded.append(Prediction(prediction.track_id, prediction.fallback, tree, mixture))
+    return tuple(decoded)
+
+
+def _decode_mixtures(messages: Sequence[pb.Mixture]) -> list[Mixture]:
+    wires = [_packed_fields(message.SerializeToString()) for message in messages]
+    columns, lengths = _table(pb.Mixture.DESCRIPTOR, wires, ("weight", "x", "y", "sigma_x", "sigma_y", "rho"))
+    _require(bool((columns[3:5] > 0).all()), messages[0], "has a sigma that is not positive")
+    mixtures = []
+    means, sigmas = np.ascontiguousarray(columns[1:3].T), np.ascontiguousarray(columns[3:5].T)  # (S, 2) each
+    for message, weights, mean, sigma, rhos in zip(
+        messages, *(_split(part, lengths) for part in (columns[0], means, sigmas, columns[5])), strict=True
+    ):
+        K = message.components
+        _require(K > 0 and len(weights) % K == 0, message, f"has {len(weights)} entries for {K} components")
+        steps = (-1, K)
+        mixtures.append(
+            Mixture(weights.reshape(steps), mean.reshape(*steps, 2), sigma.reshape(*steps, 2), rhos.reshape(steps))
+        )
+    return mixtures
 
 
 _ENCODERS: dict[type, Callable[[Any], Message]] = {

@@ -118,7 +118,7 @@ class Track:
     history: TrackHistory
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrackFrame:
     """The tracker's answer to one LiDAR scan; carries all the history a predictor needs."""
 
@@ -159,7 +159,7 @@ class Prediction:
     mixture: Mixture
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PredictionFrame:
     """The predictor's answer to the TrackFrame of the same sequence."""
 

@@ -1,0 +1,1 @@
+"""PCGAN: the predictor network, its training, and the process that serves it."""

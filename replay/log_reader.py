@@ -1,0 +1,328 @@
+"""Recordings in: several MCAP files as one stream of raw messages in log-time order, CRCs checked.
+
+Memory is bounded by the chunks that overlap in time, whatever the length of the log. Files are opened for reading only.
+"""
+
+import hashlib
+import heapq
+import io
+import struct
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import zip_longest
+from operator import attrgetter
+from pathlib import Path
+from typing import IO, NamedTuple
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+from mcap.reader import NonSeekingReader, SeekingReader
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
+
+from replay.errors import LogError
+
+# Files without an index, and damaged ones, come in file order: writers interleave sensors by less than this.
+REORDER_NS = 2_000_000_000
+
+
+class RawMessage(NamedTuple):
+    """One message as it lies in the file."""
+
+    topic: str
+    log_time_ns: int
+    schema_name: str
+    encoding: str
+    data: bytes
+
+
+class ChannelInfo(NamedTuple):
+    """What a file says about one topic."""
+
+    topic: str
+    schema_name: str
+    encoding: str
+    messages: int
+
+
+@dataclass
+class Losses:
+    """What `--salvage` could not read."""
+
+    chunks: int = 0
+    notes: list[str] = field(default_factory=list)
+
+
+class LogReader:
+    """Several MCAP files (a split recording, a drive and its sidecar) read as one log.
+
+    Raises LogError naming file and problem if a file is no MCAP, is cut short, or has no summary, unless `salvage`.
+    """
+
+    def __init__(self, paths: Sequence[Path], *, salvage: bool = False):
+        if not paths:
+            raise LogError("no recording given")
+        self.paths = tuple(paths)
+        self.losses = Losses()
+        self._files = [_open(path, self.losses if salvage else None) for path in self.paths]
+        starts = [file.start_ns for file in self._files if file.channels]
+        if not starts:
+            raise LogError(f"{_names(self.paths)} holds no messages")
+        self.start_ns = min(starts)
+        self.end_ns = max(file.end_ns for file in self._files if file.channels)
+
+    @property
+    def channels(self) -> tuple[ChannelInfo, ...]:
+        """The topics of all files, sorted by name; a topic in several files is counted together."""
+        merged: dict[tuple[str, str, str], int] = {}
+        for file in self._files:
+            for channel in file.channels:
+                key = channel[:3]
+                merged[key] = merged.get(key, 0) + channel.messages
+        return tuple(ChannelInfo(*key, count) for key, count in sorted(merged.items()))
+
+    def messages(
+        self, topics: Collection[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """Yields messages in log-time order, start_ns <= log time < end_ns; ties in file order."""
+        streams = [file.messages(topics, start_ns, end_ns) for file in self._files]
+        return heapq.merge(*streams, key=_log_time)
+
+
+def checksum(path: Path) -> str:
+    """Returns the SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _names(paths: Iterable[Path]) -> str:
+    return ", ".join(path.name for path in paths)
+
+
+class _IndexedFile:
+    """An intact MCAP file, read through its index."""
+
+    def __init__(self, path: Path):
+        self._path = path
+        try:
+            with path.open("rb") as stream:
+                summary = SeekingReader(stream, validate_crcs=True).get_summary()
+        except OSError:
+            raise
+        except Exception as error:  # what mcap raises on damage has no common base
+            raise LogError(f"{path} is not a readable MCAP file ({_described(path, error)}){_HINT}") from error
+        if summary is None or summary.statistics is None:
+            raise LogError(f"{path} has no summary section: the recording was not closed{_HINT}")
+        counts = summary.statistics.channel_message_counts
+        self._summary = summary
+        self.start_ns = summary.statistics.message_start_time
+        self.end_ns = summary.statistics.message_end_time
+        self.channels = tuple(
+            ChannelInfo(channel.topic, _schema_name(summary.schemas, channel), channel.message_encoding, count)
+            for identifier, channel in summary.channels.items()
+            if (count := counts.get(identifier, 0))
+        )
+
+    def messages(
+        self, topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
+    ) -> Iterator[RawMessage]:
+        with self._path.open("rb") as stream:
+            raw = self._chunks(stream, topics, start_ns, end_ns) if self._summary.chunk_indexes else self._plain(stream)
+            for message in _damage_named(self._path, raw):
+                if (
+                    (topics is None or message.topic in topics)
+                    and (start_ns is None or message.log_time_ns >= start_ns)
+                    and (end_ns is None or message.log_time_ns < end_ns)
+                ):
+                    yield message
+
+    def _plain(self, stream: IO[bytes]) -> Iterator[RawMessage]:
+        """Yields the messages of a file without chunks."""
+        records = NonSeekingReader(stream, validate_crcs=True).iter_messages(log_time_order=False)
+        return _reordered(_raw(schema.name if schema else "", channel, message) for schema, channel, message in records)
+
+    def _chunks(
+        self, stream: IO[bytes], topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
+    ) -> Iterator[RawMessage]:
+        """Yields the messages of the chunks that hold something wanted, in log-time order.
+
+        A message waits only for the chunks that begin before it. (mcap's own reader keeps every message in a heap with
+        a comparison in Python, which costs more than everything else there is to do with it.)
+        """
+        channels = self._summary.channels
+        names = {identifier: _schema_name(self._summary.schemas, channel) for identifier, channel in channels.items()}
+        wanted = {identifier for identifier, channel in channels.items() if topics is None or channel.topic in topics}
+        chunks = sorted(
+            (
+                chunk
+                for chunk in self._summary.chunk_indexes
+                if (not chunk.message_index_offsets or wanted & chunk.message_index_offsets.keys())
+                and (start_ns is None or chunk.message_end_time >= start_ns)
+                and (end_ns is None or chunk.message_start_time < end_ns)
+            ),
+            key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset),
+        )
+        waiting: list[RawMessage] = []
+        for chunk, following in zip_longest(chunks, chunks[1:]):
+            stream.seek(chunk.chunk_start_offset + _RECORD.size)
+            for identifier, log_time_ns, data in _chunk_messages(Chunk.read(ReadDataStream(stream))):
+                if identifier in wanted:
+                    channel = channels[identifier]
+                    encoding = channel.message_encoding
+                    waiting.append(RawMessage(channel.topic, log_time_ns, names[identifier], encoding, data))
+            waiting.sort(key=_log_time)
+            ready = bisect_left(waiting, following.message_start_time, key=_log_time) if following else len(waiting)
+            yield from waiting[:ready]
+            del waiting[:ready]
+
+
+class _SalvagedFile:
+    """A damaged MCAP file, read chunk by chunk; bad chunks are left out and counted once.
+
+    Two passes: a topic may be declared in a chunk that is lost, and again in the summary at the end.
+    """
+
+    def __init__(self, path: Path, losses: Losses):
+        self._path = path
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        counts: Counter[int] = Counter()
+        self.start_ns, self.end_ns = 2**63, 0
+        for record in self._records(losses):
+            if isinstance(record, Schema):
+                self._schemas[record.id] = record
+            elif isinstance(record, Channel):
+                self._channels[record.id] = record
+            elif isinstance(record, Message):
+                counts[record.channel_id] += 1
+                self.start_ns = min(self.start_ns, record.log_time)
+                self.end_ns = max(self.end_ns, record.log_time)
+        if undeclared := sum(count for channel, count in counts.items() if channel not in self._channels):
+            losses.notes.append(f"{path.name}: {undeclared} messages of topics whose declaration is lost")
+        self.channels = tuple(
+            ChannelInfo(
+                channel.topic, _schema_name(self._schemas, channel), channel.message_encoding, counts[identifier]
+            )
+            for identifier, channel in self._channels.items()
+            if counts[identifier]
+        )
+
+    def messages(
+        self, topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
+    ) -> Iterator[RawMessage]:
+        raw = (
+            _raw(_schema_name(self._schemas, channel), channel, record)
+            for record in self._records(Losses())
+            if isinstance(record, Message)
+            and (channel := self._channels.get(record.channel_id)) is not None
+            and (topics is None or channel.topic in topics)
+            and (start_ns is None or record.log_time >= start_ns)
+            and (end_ns is None or record.log_time < end_ns)
+        )
+        return _reordered(raw)
+
+    def _records(self, losses: Losses) -> Iterator[McapRecord]:
+        """Yields the records of every intact chunk, in file order, up to where the file stops making sense."""
+        with self._path.open("rb") as stream:
+            yield from self._intact(stream, losses)
+
+    def _intact(self, stream: io.BufferedReader, losses: Losses) -> Iterator[McapRecord]:
+        records = StreamReader(stream, emit_chunks=True, record_size_limit=self._path.stat().st_size).records
+        while True:
+            offset = stream.tell()
+            try:
+                record = next(records, None)
+            except Exception as error:  # what mcap raises on damage has no common base
+                losses.notes.append(
+                    f"{self._path.name}: nothing readable after byte {offset} ({_described(self._path, error)})"
+                )
+                return
+            if record is None:
+                return
+            if not isinstance(record, Chunk):
+                yield record
+                continue
+            try:
+                inside = breakup_chunk(record, validate_crc=True)
+            except Exception as error:
+                losses.chunks += 1
+                losses.notes.append(
+                    f"{self._path.name}: chunk at byte {offset} is damaged ({_described(self._path, error)})"
+                )
+                continue
+            yield from inside
+
+
+_RECORD = struct.Struct("<BQ")  # opcode, length of what follows
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time, before the data
+_log_time = attrgetter("log_time_ns")
+_HINT = "; try --salvage"
+
+
+def _open(path: Path, losses: Losses | None) -> _IndexedFile | _SalvagedFile:
+    try:
+        return _IndexedFile(path) if losses is None else _SalvagedFile(path, losses)
+    except OSError as error:
+        raise LogError(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def _described(path: Path, error: Exception) -> str:
+    if path.stat().st_size == 0:
+        return "the file is empty"
+    name = type(error).__name__
+    known = {"EndOfFile": "it ends early", "RecordLengthLimitExceeded": "it is cut short or damaged"}
+    return known.get(name) or f"{str(error) or name}"
+
+
+def _chunk_messages(chunk: Chunk) -> Iterator[tuple[int, int, bytes]]:
+    """Yields channel id, log time and data of each message in a chunk, its CRC checked.
+
+    As mcap's `breakup_chunk`, without an object per message and a read per field: a log has hundreds a second.
+    """
+    stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+    data = stream.read(length)
+    at = 0
+    while at < length:
+        opcode, size = _RECORD.unpack_from(data, at)
+        at += _RECORD.size
+        if at + size > length:
+            raise EndOfFile
+        if opcode == Opcode.MESSAGE:
+            identifier, _, log_time_ns, _ = _MESSAGE.unpack_from(data, at)
+            yield identifier, log_time_ns, data[at + _MESSAGE.size : at + size]
+        at += size
+
+
+def _damage_named(path: Path, messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
+    """Passes messages on; damage found on the way becomes a LogError that names the file."""
+    while True:
+        try:
+            message = next(messages)
+        except StopIteration:
+            return
+        except Exception as error:  # what mcap raises on damage has no common base
+            raise LogError(f"{path} is damaged ({_described(path, error)}){_HINT}") from error
+        yield message
+
+
+def _schema_name(schemas: Mapping[int, Schema], channel: Channel) -> str:
+    schema = schemas.get(channel.schema_id)
+    return schema.name if schema else ""
+
+
+def _raw(schema_name: str, channel: Channel, message: Message) -> RawMessage:
+    return RawMessage(channel.topic, message.log_time, schema_name, channel.message_encoding, message.data)
+
+
+def _reordered(messages: Iterable[RawMessage]) -> Iterator[RawMessage]:
+    """Sorts messages that are out of log-time order by less than REORDER_NS; stable."""
+    waiting: list[tuple[int, int, RawMessage]] = []
+    for index, message in enumerate(messages):
+        heapq.heappush(waiting, (message.log_time_ns, index, message))
+        while waiting[0][0] <= message.log_time_ns - REORDER_NS:
+            yield heapq.heappop(waiting)[2]
+    while waiting:
+        yield heapq.heappop(waiting)[2]

@@ -1,0 +1,149 @@
+"""The main job: a replay written down, viewed, scored and summed up."""
+
+import concurrent.futures
+import json
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+
+from replay.errors import OutputError, PredictorError
+from replay.frame_result import FrameResult
+from replay.interrupts import Interrupted, Interrupts
+from replay.log_reader import checksum
+from replay.log_writer import LogWriter
+from replay.rerun_view import NullView, View
+from replay.score import ReplayScore
+from replay.session import Replay
+
+
+@dataclass
+class Summary:
+    """What a replay did; `as_json` is what `--json` writes."""
+
+    frames: int = 0
+    track_ids: set[tuple[int, int]] = field(default_factory=set)  # (epoch, id)
+    predictions: int = 0
+    fallbacks: int = 0
+    log_s: float = 0.0
+    wall_s: float = 0.0
+    startup_s: float = 0.0
+    restarts: int = 0
+    model: dict[str, str] = field(default_factory=dict)
+    refused: int = 0
+    refusals: list[dict[str, object]] = field(default_factory=list)
+    first_refusals: list[str] = field(default_factory=list)
+    salvage_losses: list[str] = field(default_factory=list)
+    latency_ms: dict[str, dict[str, float]] = field(default_factory=dict)
+    score: dict[str, object] = field(default_factory=dict)
+    complete: bool = False
+    stopped: BaseException | None = None  # what ended the replay before the log did
+
+    @property
+    def clean(self) -> bool:
+        """True if nothing was refused or lost."""
+        return not self.refused and not self.salvage_losses
+
+    def as_json(self) -> dict[str, object]:
+        """Returns everything under the names that users rely on."""
+        return {
+            "complete": self.complete,
+            "frames": self.frames,
+            "tracks": len(self.track_ids),
+            "predictions": self.predictions,
+            "fallbacks": self.fallbacks,
+            "refused": self.refused,
+            "refusals": self.refusals,
+            "salvage_losses": self.salvage_losses,
+            "predictor_restarts": self.restarts,
+            "model": self.model,
+            "log_s": round(self.log_s, 3),
+            "wall_s": round(self.wall_s, 3),
+            "startup_s": round(self.startup_s, 3),
+            "realtime_factor": round(self.log_s / self.wall_s, 2) if self.wall_s else None,
+            "latency_ms": self.latency_ms,
+            **self.score,
+        }
+
+
+def record(
+    run: Replay,
+    output: Path | None = None,
+    view: View | None = None,
+    *,
+    on_frame: Callable[[FrameResult], None] = lambda _: None,
+) -> Summary:
+    """Replays a log into an MCAP file and a view, and scores it.
+
+    Ctrl-C, SIGTERM and a predictor that fails for good end it early: the outputs are then complete up to the last
+    frame, and the summary's `stopped` holds the reason. Raises LogError or OutputError for anything else; the output
+    then stays as NAME.part.
+    """
+    if output is not None and any(output.resolve() == path.resolve() for path in run.reader.paths):
+        raise OutputError(f"{output} is the recording itself, which is never overwritten; choose another output")
+    summary = Summary(salvage_losses=run.reader.losses.notes)
+    score = ReplayScore()
+    last_ns = run.start_ns
+    started = time.perf_counter()
+    with ExitStack() as stack:
+        hashing = stack.enter_context(concurrent.futures.ThreadPoolExecutor(1))
+        checksums = hashing.submit(lambda: [checksum(path) for path in run.reader.paths])
+        interrupts = stack.enter_context(Interrupts())
+        stack.enter_context(run)
+        ready = time.perf_counter()
+        writer = stack.enter_context(LogWriter(output)) if output is not None else None
+        shown = stack.enter_context(view or NullView())
+        try:
+            for result in run:
+                with interrupts.shield():
+                    if writer is not None:
+                        with run.clock.measure("write"):
+                            writer.write(result)
+                    shown.show(result)
+                    with run.clock.measure("score"):
+                        score.add(result)
+                    _count(summary, result)
+                    last_ns = result.log_time_ns
+                on_frame(result)
+            summary.complete = True
+            last_ns = run.end_ns
+        except (Interrupted, PredictorError) as error:
+            summary.stopped = error
+        interrupts.ignore()  # the outputs are being closed; that takes no time worth interrupting
+        if writer is not None:
+            writer.describe(_lineage(run, checksums.result(), complete=summary.complete), _settings(run))
+    summary.wall_s = time.perf_counter() - ready
+    summary.startup_s = ready - started
+    summary.log_s = (last_ns - run.start_ns) / 1e9
+    summary.refused, summary.refusals = run.refusals.total, run.refusals.as_json()
+    summary.first_refusals = run.refusals.first
+    summary.restarts = run.predictor.restarts
+    summary.model = {"name": run.predictor.model.name, "sha256": run.predictor.model.checksum}
+    summary.latency_ms = run.clock.as_json()
+    summary.score = score.as_json()
+    return summary
+
+
+def _count(summary: Summary, result: FrameResult) -> None:
+    summary.frames += 1
+    summary.track_ids.update((result.tracks.epoch, track.id) for track in result.tracks.tracks)
+    summary.predictions += len(result.predictions.predictions)
+    summary.fallbacks += sum(prediction.fallback for prediction in result.predictions.predictions)
+
+
+def _lineage(run: Replay, checksums: list[str], *, complete: bool) -> dict[str, str]:
+    """What the output came from; base names only, so that the folder a log lies in changes nothing."""
+    inputs = [{"name": path.name, "sha256": digest} for path, digest in zip(run.reader.paths, checksums, strict=True)]
+    return {
+        "complete": json.dumps(complete),
+        "inputs": json.dumps(inputs),
+        "model": run.predictor.model.name,
+        "model_sha256": run.predictor.model.checksum,
+        "version": version("pcgan"),
+    }
+
+
+def _settings(run: Replay) -> bytes:
+    return json.dumps(run.settings.model_dump(mode="json"), indent=2, sort_keys=True).encode()

@@ -1,0 +1,349 @@
+"""Predictors the pipeline can ask: one in this process, or one on the bus, spawned or already running.
+
+All three take track frames with `ask` and give their answers in the same order with `answer`. The one on the bus loses
+nothing: what a predictor that died left unanswered is sent again, in order, and the first answer to a sequence counts.
+"""
+
+import contextlib
+import queue
+import secrets
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections import OrderedDict, deque
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Protocol, Self
+
+import zenoh
+
+from pcgan.bus import ENCODING, BusError, ModelIdentity, any_alive_key, model_of, open_session
+from replay.errors import PredictorError
+from schemas import codec, topics
+from schemas.messages import PredictionFrame, TrackFrame, VehiclePose
+
+_POLL_S = 0.05
+
+
+class AskedPredictor(Protocol):
+    """What the pipeline needs of a predictor."""
+
+    @property
+    def model(self) -> ModelIdentity:
+        """The weights that answer."""
+        ...
+
+    @property
+    def restarts(self) -> int:
+        """How often a predictor had to be replaced."""
+        ...
+
+    def ask(self, frame: TrackFrame, pose: VehiclePose) -> None:
+        """Sends a frame, and the vehicle's pose for whoever else listens; does not wait."""
+        ...
+
+    def answer(self) -> PredictionFrame:
+        """Waits for the answer to the oldest unanswered frame; raises PredictorError if there can be none."""
+        ...
+
+    def close(self) -> None:
+        """Ends what was started."""
+        ...
+
+
+class InlinePredictor:
+    """The predictor in this process, without zenoh."""
+
+    restarts = 0
+
+    def __init__(self, model_path: Path | None = None):
+        from pcgan.checkpoint import CheckpointError  # torch is loaded only here
+        from pcgan.predictor import Predictor
+
+        try:
+            self._predictor = Predictor.from_checkpoint(model_path)
+        except CheckpointError as error:
+            raise PredictorError(str(error)) from error
+        self.model = ModelIdentity(self._predictor.model_name, self._predictor.checksum)
+        self._asked: deque[TrackFrame] = deque()
+
+    def ask(self, frame: TrackFrame, pose: VehiclePose) -> None:  # noqa: ARG002  nobody else listens
+        """Keeps the frame until its answer is wanted."""
+        self._asked.append(frame)
+
+    def answer(self) -> PredictionFrame:
+        """Predicts the oldest frame asked."""
+        return self._predictor.step(self._asked.popleft())
+
+    def close(self) -> None:
+        """Does nothing."""
+
+
+class Child:
+    """A predictor process of our own, in its own process session so that Ctrl-C does not reach it."""
+
+    def __init__(self, endpoint: str, model_path: Path | None, log: IO[bytes]):
+        command = [sys.executable, "-m", "replay.cli", "predict", "--spawned", "--connect", endpoint]
+        if model_path is not None:
+            command += ["--model", str(model_path)]
+        self._log = log
+        self._log_start = log.tell()
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True, close_fds=True
+        )
+        self.pid = self._process.pid
+
+    def died(self) -> str | None:
+        """Returns how the process ended, with its last words; None while it lives."""
+        code = self._process.poll()
+        if code is None:
+            return None
+        self._log.seek(self._log_start)
+        words = self._log.read().decode(errors="replace").strip().splitlines()
+        return f"exit code {code}{': ' + words[-1] if words else ''}"
+
+    def stop(self, patience_s: float = 5.0) -> None:
+        """Closes its stdin, which ends it; kills it if it takes too long."""
+        with contextlib.suppress(OSError):
+            if self._process.stdin is not None:
+                self._process.stdin.close()
+        try:
+            self._process.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+class RemotePredictor:
+    """A predictor on the bus. `RemotePredictor.spawned` starts one; `RemotePredictor.external` uses a running one.
+
+    Raises PredictorError if none is ready within `startup_s`, if one has been replaced `max_failures` times in a row
+    without an answer, or if an answer makes no sense.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        *,
+        namespace: str = "",
+        startup_s: float = 60.0,
+        hang_s: float = 30.0,
+        max_failures: int = 3,
+    ):
+        self._session = session
+        self._startup_s = startup_s
+        self._hang_s = hang_s
+        self._max_failures = max_failures
+        self._run = secrets.token_bytes(8)  # tells our answers from another replay's; never in an output
+        self._child: Child | None = None
+        self._child_arguments: tuple[str, Path | None] | None = None
+        self._folder: Path | None = None
+        self._log: IO[bytes] | None = None
+        self._unanswered: OrderedDict[int, bytes] = OrderedDict()
+        self._answers: dict[int, PredictionFrame] = {}
+        self._alive: dict[str, ModelIdentity] = {}
+        self._model: ModelIdentity | None = None
+        self._failures = 0
+        self.restarts = 0
+        self._inbox: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+        self._news: queue.SimpleQueue[tuple[zenoh.SampleKind, str]] = queue.SimpleQueue()
+        self._subscriber = session.declare_subscriber(topics.zenoh_key(topics.PREDICTIONS, namespace), self._inbox.put)
+        self._watch = session.liveliness().declare_subscriber(
+            any_alive_key(namespace), lambda sample: self._news.put((sample.kind, str(sample.key_expr))), history=True
+        )
+        self._publisher = session.declare_publisher(
+            topics.zenoh_key(topics.TRACKS, namespace),
+            encoding=ENCODING.with_schema(codec.schema_name(TrackFrame)),
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+        self._pose_publisher = session.declare_publisher(
+            topics.zenoh_key(topics.VEHICLE_POSE, namespace),
+            encoding=ENCODING.with_schema(codec.schema_name(VehiclePose)),
+        )
+
+    @classmethod
+    def spawned(cls, model_path: Path | None = None, **options: float) -> Self:
+        """Starts a predictor process of our own on a private socket and waits until it serves."""
+        folder = Path(tempfile.mkdtemp(prefix="pcgan-"))
+        endpoint = _private_endpoint(folder)
+        try:
+            predictor = cls(_opened(listen=[endpoint]), **options)  # type: ignore[arg-type]
+        except PredictorError:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        predictor._folder = folder
+        predictor._log = (folder / "predictor.log").open("w+b")
+        predictor._child_arguments = (endpoint, model_path)
+        try:
+            predictor._start_child()
+            predictor._wait_until_ready()
+        except BaseException:
+            predictor.close()
+            raise
+        return predictor
+
+    @classmethod
+    def external(
+        cls, connect: str | None = None, config_file: Path | None = None, namespace: str = "", **options: float
+    ) -> Self:
+        """Uses a predictor that is already running behind an endpoint, e.g. tcp/127.0.0.1:7447."""
+        session = _opened(connect=[connect] if connect else [], config_file=config_file)
+        predictor = cls(session, namespace=namespace, **options)  # type: ignore[arg-type]
+        try:
+            predictor._wait_until_ready()
+        except BaseException:
+            predictor.close()
+            raise
+        return predictor
+
+    @property
+    def model(self) -> ModelIdentity:
+        """The weights that answer, as the predictor itself says."""
+        assert self._model is not None, "the predictor is ready before anybody can ask"
+        return self._model
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of a spawned predictor."""
+        return self._child.pid if self._child else None
+
+    def ask(self, frame: TrackFrame, pose: VehiclePose) -> None:
+        """Publishes a frame and the vehicle's pose; the frame stays on record until it is answered."""
+        self._pose_publisher.put(codec.encode(pose), attachment=self._run)
+        payload = codec.encode(frame)
+        self._unanswered[frame.sequence] = payload
+        self._publisher.put(payload, attachment=self._run)
+
+    def answer(self) -> PredictionFrame:
+        """Waits for the answer to the oldest unanswered frame, replacing a predictor that dies or hangs."""
+        sequence = next(iter(self._unanswered))
+        deadline = time.monotonic() + self._hang_s
+        while sequence not in self._answers:
+            try:
+                self._take(self._inbox.get(timeout=_POLL_S))
+            except queue.Empty:
+                reason = self._trouble(time.monotonic() > deadline)
+                if reason is not None:
+                    self._replace(reason)
+                    deadline = time.monotonic() + self._hang_s
+        self._failures = 0
+        del self._unanswered[sequence]
+        return self._answers.pop(sequence)
+
+    def close(self) -> None:
+        """Ends the session and, if it was spawned, the predictor."""
+        if self._child is not None:
+            self._child.stop()
+        self._session.close()  # type: ignore[no-untyped-call]
+        if self._log is not None:
+            self._log.close()
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self.close()
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        """Files an answer of this run; others', and second answers to one sequence, are ignored."""
+        if sample.attachment is None or sample.attachment.to_bytes() != self._run:
+            return
+        try:
+            frame = codec.decode(PredictionFrame, sample.payload.to_bytes())
+        except codec.CodecError as error:
+            raise PredictorError(f"the predictor's answer makes no sense: {error}") from error
+        if frame.sequence in self._unanswered:
+            self._answers.setdefault(frame.sequence, frame)
+
+    def _trouble(self, silent: bool) -> str | None:
+        """Returns why no answer can be expected, or None."""
+        self._read_news()
+        if self._child is not None and (ending := self._child.died()) is not None:
+            return f"the predictor died ({ending})"
+        if not self._alive:
+            return "the predictor has left the bus"
+        return f"the predictor did not answer within {self._hang_s:g} s" if silent else None
+
+    def _replace(self, reason: str) -> None:
+        """Waits for another predictor, starting it if it is ours, and sends it all that is unanswered, in order."""
+        self._failures += 1
+        if self._failures > self._max_failures:
+            raise PredictorError(f"{reason}; {self._max_failures} replacements gave no answer either")
+        self.restarts += 1
+        if self._child is not None:
+            self._child.stop(patience_s=0)
+            self._alive.clear()
+            self._start_child()
+        self._wait_until_ready()
+        for sequence, payload in self._unanswered.items():
+            if sequence not in self._answers:
+                self._publisher.put(payload, attachment=self._run)
+
+    def _start_child(self) -> None:
+        assert self._child_arguments is not None
+        assert self._log is not None
+        endpoint, model_path = self._child_arguments
+        self._log.seek(0, 2)
+        self._child = Child(endpoint, model_path, self._log)
+
+    def _wait_until_ready(self) -> None:
+        """Waits for a predictor's token and for zenoh to have matched our publisher: what is put before is lost."""
+        deadline = time.monotonic() + self._startup_s
+        while True:
+            self._read_news()
+            if self._alive and _matched(self._publisher):
+                break
+            if self._child is not None and (ending := self._child.died()) is not None:
+                raise PredictorError(f"the predictor did not start ({ending})")
+            if time.monotonic() > deadline:
+                raise PredictorError(
+                    f"no predictor was ready within {self._startup_s:g} s; start one with: pcgan predict"
+                )
+            time.sleep(0.005)
+        found = next(iter(self._alive.values()))
+        if self._model is not None and found != self._model:
+            raise PredictorError(f"the new predictor runs {found.name}, the one before ran {self._model.name}")
+        self._model = found
+
+    def _read_news(self) -> None:
+        for kind, key in _drained(self._news):
+            if kind == zenoh.SampleKind.PUT:
+                self._alive[key] = model_of(key)
+            else:
+                self._alive.pop(key, None)
+
+
+def _drained(news: "queue.SimpleQueue[tuple[zenoh.SampleKind, str]]") -> Iterator[tuple[zenoh.SampleKind, str]]:
+    with contextlib.suppress(queue.Empty):
+        while True:
+            yield news.get_nowait()
+
+
+def _matched(publisher: zenoh.Publisher) -> bool:
+    # zenoh's stubs take the status for a bool; as an object it is always true
+    return bool(publisher.matching_status.matching)  # type: ignore[attr-defined]
+
+
+def _opened(
+    listen: list[str] | None = None, connect: list[str] | None = None, config_file: Path | None = None
+) -> zenoh.Session:
+    try:
+        return open_session(listen=listen or (), connect=connect or (), config_file=config_file)
+    except BusError as error:
+        raise PredictorError(str(error)) from error
+
+
+def _private_endpoint(folder: Path) -> str:
+    """Returns a socket in a folder only we can enter; a loopback port where there are no Unix sockets."""
+    path = folder / "bus"
+    if hasattr(socket, "AF_UNIX") and len(str(path)) < 100:  # sockaddr_un holds 108 bytes
+        return f"unixsock-stream/{path}"
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

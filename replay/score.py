@@ -1,0 +1,267 @@
+"""A replay's score of itself: predictions against where the tracks, and the people, were found later.
+
+Works while frames stream by. What it keeps is a few seconds of positions and, where the log holds ground truth, a few
+numbers per person and frame for the tracking scores, which need the whole drive.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from pcgan import metrics
+from pcgan.extrapolation import extrapolate
+from replay.frame_result import FrameResult
+from schemas.messages import BoolArray, FloatArray, GroundTruthFrame, IntArray, Track
+from tracking.metrics import ScoredFrame, score
+
+MAX_GAP_NS = 350_000_000  # a position is interpolated between measurements at most this far apart
+MATCH_M = 1.0  # a track further than this from everybody stands for nobody
+MIN_LIDAR_POINTS = 4  # whoever has fewer is neither missed nor, if tracked, a false track
+
+
+@dataclass
+class Errors:
+    """Running means over scored predictions; NaN before the first."""
+
+    scored: int = 0
+    sums: FloatArray = field(default_factory=lambda: np.zeros(4))  # ade, fde, mhd, nll
+
+    def add(self, rows: FloatArray) -> None:
+        """Takes (n, 4) rows of ADE, FDE, MHD in m and NLL in nats."""
+        self.scored += len(rows)
+        self.sums = self.sums + rows.sum(axis=0)
+
+    def as_json(self) -> dict[str, float | None]:
+        """Returns the means by name; None before the first prediction was scored."""
+        means = (self.sums / self.scored).tolist() if self.scored else [None] * 4
+        return dict(zip(("ade_m", "fde_m", "mhd_m", "nll"), means, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Positions:
+    """Who was where at one stamp; `ids` rise."""
+
+    stamp_ns: int
+    ids: IntArray  # (A,)
+    positions_m: FloatArray  # (A, 2)
+    measured: BoolArray  # (A,)
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """The network's predictions of one frame and the extrapolations beside them; A rows."""
+
+    stamp_ns: int
+    dt_s: float
+    track_ids: IntArray  # (A,)
+    person_ids: IntArray  # (A,)  whom the track stands for in the ground truth; -1 for nobody
+    paths_m: FloatArray  # (A, P, 2)  most probable path
+    mixtures: tuple[
+        FloatArray, FloatArray, FloatArray, FloatArray
+    ]  # weights (A, P, K), means (A, P, K, 2), sigmas (A, P, K, 2), correlations
+    extrapolated: tuple[FloatArray, ...]  # paths (A, P, 2), sigmas (A, P, 2), correlations (A, P)
+
+
+class ReplayScore:
+    """Takes frame results in order; `as_json` at the end.
+
+    A prediction is scored if all its steps fall where the track was measured later: between two measurements at most
+    0.35 s apart. Fallbacks are the tracker's extrapolation itself and are left out.
+    """
+
+    def __init__(self) -> None:
+        self._asked: deque[_Asked] = deque()
+        self._tracked: deque[Positions] = deque()
+        self._true: deque[Positions] = deque()
+        self._frames: list[ScoredFrame] = []
+        self._epoch = 0
+        self.predictions = 0
+        self.fallbacks = 0
+        self.against_tracks = {"predictor": Errors(), "tracker": Errors()}
+        self.against_truth = {"predictor": Errors(), "tracker": Errors()}
+
+    def add(self, result: FrameResult) -> None:
+        """Takes the next frame and scores the predictions that are due."""
+        if result.tracks.epoch != self._epoch:
+            self._settle(None)
+            self._epoch = result.tracks.epoch
+            self._tracked.clear()
+            self._true.clear()
+        tracks, truth = result.tracks.tracks, result.ground_truth
+        stamp_ns = result.tracks.stamp_ns
+        self._tracked.append(_track_positions(stamp_ns, tracks))
+        person_of: IntArray = np.full(len(tracks), -1, np.int64)
+        if truth is not None:
+            self._true.append(true_positions(truth))
+            person_of = match(tracks, truth)
+            self._frames.append(_scored_frame(tracks, truth))
+        self._ask(result, person_of)
+        self._settle(stamp_ns)
+
+    def as_json(self) -> dict[str, object]:
+        """Scores what can still be scored and returns all figures."""
+        self._settle(None)
+        measured, true = self.against_tracks, self.against_truth
+        figures: dict[str, object] = {
+            **measured["predictor"].as_json(),
+            "scored": measured["predictor"].scored,
+            "scored_share": _share(measured["predictor"].scored, self.predictions),
+            "tracker": measured["tracker"].as_json(),
+            "fallbacks": self.fallbacks,
+        }
+        if self._frames:
+            figures["ground_truth"] = {
+                **true["predictor"].as_json(),
+                "scored": true["predictor"].scored,
+                "scored_share": _share(true["predictor"].scored, self.predictions),
+                "tracker": true["tracker"].as_json(),
+                **asdict(score(self._frames)),
+            }
+        return figures
+
+    def _ask(self, result: FrameResult, person_of: IntArray) -> None:
+        predictions = result.predictions.predictions
+        rows = [i for i, prediction in enumerate(predictions) if not prediction.fallback]
+        self.predictions += len(predictions)
+        self.fallbacks += len(predictions) - len(rows)
+        if not rows:
+            return
+        tracks = [result.tracks.tracks[i] for i in rows]
+        paths = np.array([predictions[i].paths[0].points_m for i in rows])
+        mixtures = [predictions[i].mixture for i in rows]
+        stacked = (
+            np.array([mixture.weights for mixture in mixtures], float),
+            np.array([mixture.means_m for mixture in mixtures], float),
+            np.array([mixture.sigmas_m for mixture in mixtures], float),
+            np.array([mixture.rhos for mixture in mixtures], float),
+        )
+        states = np.array([track.state for track in tracks])
+        covariances = np.array([track.covariance for track in tracks])
+        dt_s = result.predictions.dt_s
+        ids = np.array([track.id for track in tracks], np.int64)
+        extrapolated = extrapolate(states, covariances, dt_s, paths.shape[1])
+        self._asked.append(_Asked(result.tracks.stamp_ns, dt_s, ids, person_of[rows], paths, stacked, extrapolated))
+
+    def _settle(self, now_ns: int | None) -> None:
+        """Scores the predictions whose last step lies far enough back; all of them without a present time."""
+        while self._asked:
+            asked = self._asked[0]
+            steps_ns = _steps_ns(asked)
+            if now_ns is not None and now_ns < steps_ns[-1] + MAX_GAP_NS:
+                break
+            self._asked.popleft()
+            _compare(asked, asked.track_ids, lookup(self._tracked, asked.track_ids, steps_ns), self.against_tracks)
+            if self._true:
+                _compare(asked, asked.person_ids, lookup(self._true, asked.person_ids, steps_ns), self.against_truth)
+        oldest_ns = self._asked[0].stamp_ns if self._asked else now_ns
+        for seen in (self._tracked, self._true):
+            while seen and oldest_ns is not None and seen[0].stamp_ns < oldest_ns:
+                seen.popleft()
+
+
+def _steps_ns(asked: _Asked) -> IntArray:
+    P = asked.paths_m.shape[1]
+    steps: IntArray = asked.stamp_ns + np.round(asked.dt_s * 1e9 * np.arange(1, P + 1)).astype(np.int64)
+    return steps
+
+
+def lookup(seen: Sequence[Positions], ids: IntArray, steps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
+    """Returns where `ids` (A,) were at `steps_ns` (P,), as (A, P, 2), and who was measured around every step (A,)."""
+    window = [frame for frame in seen if frame.stamp_ns <= steps_ns[-1] + MAX_GAP_NS]
+    A, F, P = len(ids), len(window), len(steps_ns)
+    if F == 0 or A == 0:
+        return np.zeros((A, P, 2)), np.zeros(A, bool)
+    order = np.argsort(ids, kind="stable")
+    everybody = np.concatenate([frame.ids for frame in window])
+    place = np.minimum(np.searchsorted(ids[order], everybody), A - 1)
+    wanted = ids[order][place] == everybody
+    row = np.repeat(np.arange(F), [len(frame.ids) for frame in window])[wanted]
+    column = order[place[wanted]]
+    positions = np.zeros((F, A, 2))
+    measured = np.zeros((F, A), bool)
+    positions[row, column] = np.concatenate([frame.positions_m for frame in window])[wanted]
+    measured[row, column] = np.concatenate([frame.measured for frame in window])[wanted]
+    stamps = np.array([frame.stamp_ns for frame in window], np.int64)
+    # index of the last measured frame up to each frame, and of the first from it on
+    index = np.arange(F)[:, None]
+    last = np.maximum.accumulate(np.where(measured, index, -1), axis=0)  # (F, A)
+    first = np.minimum.accumulate(np.where(measured, index, F)[::-1], axis=0)[::-1]
+    after = np.searchsorted(stamps, steps_ns)  # (P,)  first frame at or past the step
+    before = np.searchsorted(stamps, steps_ns, side="right") - 1
+    first_after = np.where(after[:, None] < F, first[np.minimum(after, F - 1)], F)  # (P, A)
+    last_before = np.where(before[:, None] >= 0, last[np.maximum(before, 0)], -1)
+    inside = (first_after < F) & (last_before >= 0)
+    low, high = np.where(inside, last_before, 0), np.where(inside, first_after, 0)
+    gap_ns = stamps[high] - stamps[low]
+    known = inside & (gap_ns <= MAX_GAP_NS)
+    fraction = np.where(gap_ns > 0, (steps_ns[:, None] - stamps[low]) / np.maximum(gap_ns, 1), 0.0)
+    column = np.broadcast_to(np.arange(A), (P, A))
+    start, end = positions[low, column], positions[high, column]  # (P, A, 2)
+    found = start + fraction[..., None] * (end - start)
+    return found.swapaxes(0, 1), np.asarray(known.all(axis=0))
+
+
+def _compare(
+    asked: _Asked,
+    ids: IntArray,
+    found: tuple[FloatArray, BoolArray],
+    errors: dict[str, Errors],
+) -> None:
+    positions, known = found
+    rows = np.flatnonzero(known & (ids >= 0))
+    if len(rows) == 0:
+        return
+    true = positions[rows]
+    weights, means, spreads, correlations = (part[rows] for part in asked.mixtures)
+    predicted_nll = metrics.nll(weights, means, spreads, correlations, true)
+    paths, sigmas, rhos = (part[rows] for part in asked.extrapolated)
+    extrapolated_nll = metrics.nll(
+        np.ones_like(rhos)[..., None], paths[:, :, None], sigmas[:, :, None], rhos[..., None], true
+    )
+    for who, path, nll in (("predictor", asked.paths_m[rows], predicted_nll), ("tracker", paths, extrapolated_nll)):
+        columns = (metrics.ade(path, true), metrics.fde(path, true), metrics.mhd(path, true), nll)
+        errors[who].add(np.column_stack(columns))
+
+
+def _track_positions(stamp_ns: int, tracks: Sequence[Track]) -> Positions:
+    ids = np.array([track.id for track in tracks], np.int64)
+    order = np.argsort(ids)
+    positions = np.array([track.state[:2] for track in tracks], float).reshape(-1, 2)
+    measured = np.array([not track.history.coasting[-1] for track in tracks], bool)
+    return Positions(stamp_ns, ids[order], positions[order], measured[order])
+
+
+def true_positions(truth: GroundTruthFrame) -> Positions:
+    """Returns everybody of a ground truth frame; all of them count as measured."""
+    ids = truth.ids.astype(np.int64)
+    order = np.argsort(ids)
+    return Positions(truth.stamp_ns, ids[order], truth.positions_m[order], np.ones(len(ids), bool))
+
+
+def match(tracks: Sequence[Track], truth: GroundTruthFrame) -> IntArray:
+    """Returns whom each track stands for (A,), -1 for nobody: one to one, least total distance, within 1 m."""
+    person_of = np.full(len(tracks), -1, np.int64)
+    if len(tracks) and len(truth.ids):
+        positions = np.array([track.state[:2] for track in tracks])
+        distances = np.linalg.norm(positions[:, None] - truth.positions_m, axis=-1)
+        rows, columns = linear_sum_assignment(np.minimum(distances, MATCH_M))
+        near = distances[rows, columns] < MATCH_M
+        person_of[rows[near]] = truth.ids[columns[near]]
+    return person_of
+
+
+def _scored_frame(tracks: Sequence[Track], truth: GroundTruthFrame) -> ScoredFrame:
+    return ScoredFrame(
+        truth.ids.astype(np.int32),
+        truth.positions_m.astype(np.float32),
+        np.array([track.id for track in tracks], np.int32),
+        np.array([track.state[:2] for track in tracks], np.float32).reshape(-1, 2),
+        truth.lidar_points < MIN_LIDAR_POINTS,
+    )
+
+
+def _share(part: int, whole: int) -> float | None:
+    return part / whole if whole else None

@@ -1,0 +1,53 @@
+"""USyd-style drives in MCAP, simulated: a crowd or an annotated clip, six cameras, a LiDAR, odometry, ground truth."""
+
+import math
+from pathlib import Path
+
+from replay.simulator import drive
+from replay.simulator.clip_motion import clip_motion
+from replay.simulator.drive import DriveSummary, Progress
+from replay.simulator.motion import SimulationError
+from replay.simulator.social_force import crowd_motion
+
+__all__ = ["DriveSummary", "SimulationError", "simulate"]
+
+
+def simulate(
+    output: Path,
+    *,
+    clip: str | None,
+    vehicle: int | None,
+    pedestrians: int,
+    duration_s: float,
+    seed: int,
+    progress: Progress | None = None,
+) -> DriveSummary:
+    """Writes a simulated drive; the same arguments give the same bytes.
+
+    Args:
+        output: the MCAP file to write; it appears under this name only when complete.
+        clip: an annotated clip to drive through ("dut/roundabout_04"), or None for a simulated crowd.
+        vehicle: which of the clip's vehicles records; None for the one that moves and is present longest.
+        pedestrians: how many people there are around the vehicle; a clip has its own.
+        duration_s: how long; a clip ends when its vehicle leaves, if that is sooner.
+        seed: of the crowd and of the sensors, 0 or more.
+        progress: called now and then with the fraction done.
+
+    Raises SimulationError saying what to ask for instead; pcgan.clips.DataNotFound where a clip's data set is not on
+    this machine; OSError if writing fails.
+    """
+    if seed < 0:
+        raise SimulationError(f"a seed must be 0 or more, got {seed}")
+    if not (math.isfinite(duration_s) and duration_s > 0):
+        raise SimulationError(f"a drive needs a positive duration, got {duration_s} s")
+    if clip is None and vehicle is not None:
+        raise SimulationError(f"vehicle {vehicle} is one of a clip's; name the clip, too")
+    if clip is None:
+        motion = crowd_motion(pedestrians, duration_s, seed)
+        settings: dict[str, object] = {"pedestrians": pedestrians, "duration_s": duration_s}
+    else:
+        motion = clip_motion(clip, vehicle, seed)
+        settings = {"clip": clip, "vehicle": vehicle, "duration_s": duration_s}
+    return drive.simulate(
+        motion, output, seed, duration_s=duration_s, settings={**settings, "seed": seed}, progress=progress
+    )

@@ -1,0 +1,257 @@
+"""Unsynchronised messages in, one `SensorFrame` per LiDAR scan out, in stamp order.
+
+A scan is released when every camera in use, and the vehicle's pose, have passed it, or when log time has moved on by a
+fixed wait. Only stamps and log times decide, so that the machine's speed changes nothing.
+"""
+
+import heapq
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from replay.errors import LogError, Refusals
+from replay.pose_buffer import PoseBuffer
+from replay.stamp_guard import StampGuard, Verdict
+from replay.transform_tree import TransformTree
+from schemas.messages import (
+    CameraCalibration,
+    CameraDetections,
+    CompressedImage,
+    GroundTruthFrame,
+    LidarClusters,
+    Transform,
+    VehiclePose,
+)
+from tracking.camera import CalibrationError, CameraModel
+from tracking.sensor_frame import CameraFrame, SensorFrame
+
+DEFAULT_VEHICLE_FRAME = "base_link"  # of poses that do not name the frame they are of
+
+Stamped = TypeVar("Stamped", CameraDetections, CompressedImage)
+
+
+class SyncSettings(BaseModel):
+    """When a scan is released, and what may accompany it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    camera_tolerance_ms: float = Field(
+        default=50, gt=0, description="largest gap between a scan and a camera's detections"
+    )
+    wait_ms: float = Field(
+        default=300, ge=0, description="log time after which a scan is released whatever is still missing"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SyncedFrame:
+    """One scan with everything around it, and when it was known."""
+
+    log_time_ns: int  # of the message that released it
+    epoch: int  # counts clock resets
+    sensors: SensorFrame
+    vehicle_state: NDArray[np.float64]  # (5,)  x, y, yaw, vx, vy in the odometry frame
+    images: Mapping[str, CompressedImage]
+    ground_truth: GroundTruthFrame | None
+    late: bool = False  # its successors were released before it: it amends the tracks and gives no frame of its own
+
+
+@dataclass
+class _Camera:
+    """What one camera has sent lately."""
+
+    detections: deque[CameraDetections] = field(default_factory=lambda: deque(maxlen=32))
+    images: deque[CompressedImage] = field(default_factory=lambda: deque(maxlen=8))
+    latest_ns: int = 0
+
+
+class TimeSync:
+    """Collects messages by their default topic names and releases frames.
+
+    `push` and `flush` return the frames that became complete; refused messages go to `refusals`.
+    """
+
+    def __init__(self, cameras: tuple[str, ...], settings: SyncSettings, refusals: Refusals):
+        self._settings = settings
+        self._tolerance_ns = int(settings.camera_tolerance_ms * 1e6)
+        self._wait_ns = int(settings.wait_ms * 1e6)
+        self._refusals = refusals
+        self._tree = TransformTree()
+        self._models: dict[str, tuple[CameraModel, str]] = {}  # camera -> model, optical frame
+        self._calibrations: dict[str, CameraCalibration] = {}
+        self._camera_names = cameras
+        self._epoch = 0
+        self._released_any = False
+        self._last_log_time_ns = 0
+        self._start_epoch(None)
+
+    def _start_epoch(self, reference: tuple[int, int] | None) -> None:
+        """Forgets everything that has a stamp; calibration and mounts stay."""
+        self._reference = reference
+        self._guards: dict[str, StampGuard] = {}
+        self._cameras = {name: _Camera() for name in self._camera_names}
+        self._poses = PoseBuffer()
+        self._scans: list[tuple[int, int, LidarClusters]] = []  # heap: stamp (each once), log time, scan
+        self._seen_scans: deque[int] = deque(maxlen=64)
+        self._ground_truth: deque[GroundTruthFrame] = deque(maxlen=64)
+        self._last_released_ns = 0
+
+    def preload(self, message: object, camera: str | None) -> None:
+        """Takes a calibration or transform from the beginning of the log, ahead of the stream."""
+        if isinstance(message, CameraCalibration) and camera is not None:
+            known = self._calibrations.get(camera)
+            if known is None or not _same_camera(known, message):  # logged again and again, and costly to set up
+                self._models[camera] = (CameraModel.from_calibration(message), message.frame_id)
+                self._calibrations[camera] = message
+        elif isinstance(message, Transform):
+            self._tree.add(message)
+
+    def push(self, topic: str, camera: str | None, log_time_ns: int, message: object) -> Iterator[SyncedFrame]:
+        """Takes the next message in log-time order; yields the frames it completes."""
+        self._last_log_time_ns = max(self._last_log_time_ns, log_time_ns)
+        if isinstance(message, Transform | CameraCalibration):
+            self._take_static(topic, camera, message)
+        else:
+            stamp_ns: int = message.stamp_ns  # type: ignore[attr-defined]
+            verdict = self._guard(topic).check(stamp_ns, log_time_ns)
+            if verdict is Verdict.REFUSE:
+                self._refusals.add(topic, stamp_ns, "absurd stamp", f"log time {log_time_ns / 1e9:.3f} s")
+                return
+            if verdict is Verdict.NEW_EPOCH:
+                yield from self.flush()
+                self._epoch += 1
+                self._start_epoch((stamp_ns, log_time_ns))
+                self._guard(topic).check(stamp_ns, log_time_ns)
+            yield from self._take_stamped(topic, camera, log_time_ns, message)
+        yield from self._release(lambda scan_ns, arrived_ns: self._complete(scan_ns) or self._waited(arrived_ns))
+
+    def flush(self) -> Iterator[SyncedFrame]:
+        """Yields what is still waiting, at the end of the log or of an epoch."""
+        yield from self._release(lambda *_: True)
+
+    def _guard(self, topic: str) -> StampGuard:
+        return self._guards.setdefault(topic, StampGuard(self._reference))
+
+    def _take_static(self, topic: str, camera: str | None, message: Transform | CameraCalibration) -> None:
+        try:
+            self.preload(message, camera)
+        except CalibrationError as error:
+            self._refusals.add(topic, message.stamp_ns, "unusable calibration", str(error))
+
+    def _take_stamped(self, topic: str, camera: str | None, log_time_ns: int, message: object) -> Iterator[SyncedFrame]:
+        if isinstance(message, CameraDetections) and camera in self._cameras:
+            state = self._cameras[camera]
+            state.detections.append(message)
+            state.latest_ns = max(state.latest_ns, message.stamp_ns)
+        elif isinstance(message, CompressedImage) and camera in self._cameras:
+            self._cameras[camera].images.append(message)
+        elif isinstance(message, VehiclePose):
+            self._poses.add(message)
+        elif isinstance(message, GroundTruthFrame):
+            self._ground_truth.append(message)
+        elif isinstance(message, LidarClusters):
+            if message.stamp_ns in self._seen_scans:
+                self._refusals.add(topic, message.stamp_ns, "repeated scan")
+                return
+            self._seen_scans.append(message.stamp_ns)
+            if message.stamp_ns < self._last_released_ns:
+                late = self._synced(message)
+                if late is not None:
+                    yield replace(late, late=True)
+                return
+            heapq.heappush(self._scans, (message.stamp_ns, log_time_ns, message))
+
+    def _complete(self, scan_ns: int) -> bool:
+        cameras_due_ns = scan_ns + self._tolerance_ns
+        return self._poses.latest_ns >= cameras_due_ns and all(
+            camera.latest_ns >= cameras_due_ns for camera in self._cameras.values()
+        )
+
+    def _waited(self, arrived_ns: int) -> bool:
+        return self._last_log_time_ns >= arrived_ns + self._wait_ns
+
+    def _release(self, due: Callable[[int, int], bool]) -> Iterator[SyncedFrame]:
+        while self._scans and due(*self._scans[0][:2]):
+            stamp_ns, _, scan = heapq.heappop(self._scans)
+            frame = self._synced(scan)
+            if frame is not None:
+                self._last_released_ns = stamp_ns
+                self._released_any = True
+                yield frame
+
+    def _synced(self, scan: LidarClusters) -> SyncedFrame | None:
+        """Joins a scan with poses, cameras, images and truth; refuses it if the vehicle's pose or mount is unknown."""
+        chosen = {name: self._nearest(camera.detections, scan.stamp_ns) for name, camera in self._cameras.items()}
+        detections = {name: found for name, found in chosen.items() if found is not None and name in self._models}
+        stamps_ns = [scan.stamp_ns, *(found.stamp_ns for found in detections.values())]
+        poses = self._poses.at(stamps_ns)
+        if not poses.known[0]:
+            self._refusals.add("lidar clusters", scan.stamp_ns, "no vehicle pose within 50 ms")
+            return None
+        pose = self._poses.nearest(scan.stamp_ns)
+        vehicle_frame = pose.child_frame_id or DEFAULT_VEHICLE_FRAME
+        vehicle_from_lidar = self._mount(vehicle_frame, scan.frame_id, scan.stamp_ns)
+        if vehicle_from_lidar is None:
+            return None
+
+        map_from_vehicle = poses.map_from_vehicle[0]
+        cameras = []
+        vehicle_from_map = np.linalg.inv(poses.map_from_vehicle)  # (S, 4, 4)
+        for (name, found), vehicle_from_map_then, known in zip(
+            detections.items(), vehicle_from_map[1:], poses.known[1:], strict=True
+        ):
+            model, optical_frame = self._models[name]
+            camera_from_vehicle = self._mount(found.frame_id or optical_frame, vehicle_frame, found.stamp_ns)
+            if known and camera_from_vehicle is not None:
+                cameras.append(CameraFrame(name, found, model, camera_from_vehicle @ vehicle_from_map_then))
+        sensors = SensorFrame(
+            scan.stamp_ns,
+            scan,
+            map_from_vehicle @ vehicle_from_lidar,
+            map_from_vehicle,
+            tuple(cameras),
+            pose.frame_id,
+            vehicle_frame,
+            bool(poses.extrapolated[0]),
+        )
+        images = {name: self._nearest(camera.images, scan.stamp_ns) for name, camera in self._cameras.items()}
+        truth = next((frame for frame in self._ground_truth if frame.stamp_ns == scan.stamp_ns), None)
+        return SyncedFrame(
+            self._last_log_time_ns,
+            self._epoch,
+            sensors,
+            _vehicle_state(map_from_vehicle, self._poses.velocity(scan.stamp_ns)),
+            {name: image for name, image in images.items() if image is not None},
+            truth,
+        )
+
+    def _nearest(self, messages: deque[Stamped], stamp_ns: int) -> Stamped | None:
+        """Returns the message nearest in time, within the tolerance; of equally near ones the older."""
+        near = [m for m in messages if abs(m.stamp_ns - stamp_ns) <= self._tolerance_ns]
+        return min(near, key=lambda m: (abs(m.stamp_ns - stamp_ns), m.stamp_ns), default=None)
+
+    def _mount(self, target: str, source: str, stamp_ns: int) -> NDArray[np.float64] | None:
+        transform = self._tree.transform(target, source)
+        if transform is None:
+            problem = f"no transform joins {target!r} and {source!r}"
+            if not self._released_any:
+                raise LogError(f"{problem}; the frames of /tf_static are {', '.join(self._tree.frames) or 'none'}")
+            self._refusals.add("transforms", stamp_ns, problem)
+        return transform
+
+
+def _same_camera(a: CameraCalibration, b: CameraCalibration) -> bool:
+    return (a.frame_id, a.width_px, a.height_px, a.model) == (b.frame_id, b.width_px, b.height_px, b.model) and (
+        np.array_equal(a.distortion, b.distortion) and np.array_equal(a.intrinsics_px, b.intrinsics_px)
+    )
+
+
+def _vehicle_state(map_from_vehicle: NDArray[np.float64], velocity_mps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns [x, y, yaw, vx, vy] (5,) in the odometry frame."""
+    yaw = np.arctan2(map_from_vehicle[1, 0], map_from_vehicle[0, 0])
+    return np.array([*map_from_vehicle[:2, 3], yaw, *velocity_mps])

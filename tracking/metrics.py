@@ -1,0 +1,262 @@
+"""How good tracks are: OSPA and GOSPA per frame; HOTA, IDF1 and MOTA per drive. Arrays in, numbers out."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from schemas.messages import BoolArray, FloatArray, IntArray
+
+HOTA_THRESHOLDS = np.arange(1, 20) / 20  # 0.05 to 0.95
+_EPS = np.finfo(float).eps
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredFrame:
+    """Where people were and where the tracker said they were, at one stamp. Ids are unique within a frame."""
+
+    truth_ids: IntArray  # (A,)
+    truth_m: FloatArray  # (A, 2)
+    track_ids: IntArray  # (B,)
+    tracks_m: FloatArray  # (B, 2)
+    ignored: BoolArray = field(default_factory=lambda: np.zeros(0, bool))  # (A,), or empty: nobody is
+
+    def distances(self) -> FloatArray:
+        """Returns the distance (A, B) in m of each person to each track."""
+        return _distances(self.truth_m, self.tracks_m)
+
+
+@dataclass(frozen=True)
+class Gospa:
+    """GOSPA and its parts, in m: `total ** p` is the sum of the parts each `** p`."""
+
+    total: float
+    localisation: float
+    missed: float
+    false: float
+
+
+@dataclass(frozen=True)
+class TrackingScore:
+    """Scores of a whole drive. All but the counts and distances lie between 0 and 1, MOTA may be negative."""
+
+    hota: float
+    det_a: float  # detection accuracy, of HOTA
+    ass_a: float  # association accuracy, of HOTA
+    idf1: float
+    mota: float
+    id_switches: int
+    missed: int
+    false: int
+    ospa_m: float  # mean over frames
+    gospa_m: float
+    localisation_m: float  # mean distance of the pairs CLEAR matches
+    frames: int
+
+
+def _distances(a: FloatArray, b: FloatArray) -> FloatArray:
+    difference = np.asarray(a, float).reshape(-1, 1, 2) - np.asarray(b, float).reshape(1, -1, 2)
+    distance: FloatArray = np.hypot(difference[..., 0], difference[..., 1])
+    return distance
+
+
+def ospa(truth_m: FloatArray, tracks_m: FloatArray, cutoff_m: float = 2.0, order: float = 1.0) -> float:
+    """Returns the optimal subpattern assignment distance in m of two sets of points (A, 2) and (B, 2).
+
+    Schuhmacher, Vo and Vo, "A Consistent Metric for Performance Evaluation of Multi-Object Filters" (2008). Two empty
+    sets are 0 apart, an empty and another one `cutoff_m`.
+    """
+    A, B = len(truth_m), len(tracks_m)
+    if A == 0 or B == 0:
+        return 0.0 if A == B else cutoff_m
+    cost = np.minimum(_distances(truth_m, tracks_m), cutoff_m) ** order
+    rows, columns = linear_sum_assignment(cost)
+    total = float(cost[rows, columns].sum()) + abs(A - B) * cutoff_m**order
+    return float((total / max(A, B)) ** (1 / order))
+
+
+def gospa(truth_m: FloatArray, tracks_m: FloatArray, cutoff_m: float = 2.0, order: float = 1.0) -> Gospa:
+    """Returns the generalised OSPA (alpha 2) of two sets of points (A, 2) and (B, 2), with its parts.
+
+    Rahmathullah, Garcia-Fernandez and Svensson, "Generalized Optimal Sub-Pattern Assignment Metric" (2017): a person
+    without a track and a track without a person each cost cutoff_m ** order / 2.
+    """
+    cost = np.minimum(_distances(truth_m, tracks_m), cutoff_m)
+    rows, columns = linear_sum_assignment(cost**order)
+    matched = cost[rows, columns] < cutoff_m
+    near = float((cost[rows, columns][matched] ** order).sum())
+    pairs, unit = int(matched.sum()), cutoff_m**order / 2
+    parts = (near, (len(truth_m) - pairs) * unit, (len(tracks_m) - pairs) * unit)
+    localisation, missed, false = (part ** (1 / order) for part in parts)
+    return Gospa(sum(parts) ** (1 / order), localisation, missed, false)
+
+
+def drop_ignored(frame: ScoredFrame, gate_m: float = 2.0) -> ScoredFrame:
+    """Returns the frame without its ignored people, and without the tracks on them.
+
+    An ignored person is neither a miss nor, if tracked, a false track. A track is on an ignored person if the best
+    assignment of tracks to all people within `gate_m` puts it there.
+    """
+    if not frame.ignored.any():
+        return frame
+    keep = np.ones(len(frame.track_ids), bool)
+    gain = np.maximum(gate_m - frame.distances(), 0.0)
+    rows, columns = linear_sum_assignment(gain, maximize=True)
+    keep[columns[frame.ignored[rows] & (gain[rows, columns] > 0)]] = False
+    seen = ~frame.ignored
+    return ScoredFrame(frame.truth_ids[seen], frame.truth_m[seen], frame.track_ids[keep], frame.tracks_m[keep])
+
+
+def similarity(distances_m: FloatArray, reach_m: float = 2.0) -> FloatArray:
+    """Returns max(0, 1 - d / reach) for distances of any shape."""
+    near: FloatArray = np.maximum(0.0, 1 - distances_m / reach_m)
+    return near
+
+
+@dataclass(frozen=True, eq=False)
+class _Drive:
+    """Frames with ids as rows 0 to n - 1 and their similarities."""
+
+    truth: list[IntArray]
+    tracks: list[IntArray]
+    similarities: list[FloatArray]
+    A: int  # people in the drive
+    B: int  # tracks in the drive
+
+
+def _prepare(frames: Iterable[ScoredFrame]) -> _Drive:
+    frames = list(frames)
+    people = np.unique(np.concatenate([frame.truth_ids for frame in frames] or [np.zeros(0, np.int64)]))
+    tracks = np.unique(np.concatenate([frame.track_ids for frame in frames] or [np.zeros(0, np.int64)]))
+    return _Drive(
+        [np.searchsorted(people, frame.truth_ids) for frame in frames],
+        [np.searchsorted(tracks, frame.track_ids) for frame in frames],
+        [similarity(frame.distances()) for frame in frames],
+        len(people),
+        len(tracks),
+    )
+
+
+def hota(frames: Sequence[ScoredFrame]) -> tuple[float, float, float]:
+    """Returns HOTA, DetA and AssA of a drive, means over 19 similarity thresholds.
+
+    Luiten et al., "HOTA: A Higher Order Metric for Evaluating Multi-Object Tracking" (2021). No person and no track
+    at all gives 1; a drive with people but no track 0.
+    """
+    return _hota(_prepare(frames))
+
+
+def _hota(drive: _Drive) -> tuple[float, float, float]:
+    A, B = drive.A, drive.B
+    if A == 0 or B == 0:
+        value = 1.0 if A == B else 0.0
+        return value, value, value
+    potential, truth_count, track_count = np.zeros((A, B)), np.zeros(A), np.zeros(B)
+    for truth, tracks, sim in zip(drive.truth, drive.tracks, drive.similarities, strict=True):
+        share = sim.sum(axis=0)[None, :] + sim.sum(axis=1)[:, None] - sim
+        potential[np.ix_(truth, tracks)] += np.divide(sim, share, out=np.zeros_like(sim), where=share > _EPS)
+        truth_count[truth] += 1
+        track_count[tracks] += 1
+    alignment = potential / (truth_count[:, None] + track_count[None, :] - potential)
+
+    matches = np.zeros((len(HOTA_THRESHOLDS), A, B))
+    true_positives = np.zeros(len(HOTA_THRESHOLDS))
+    for truth, tracks, sim in zip(drive.truth, drive.tracks, drive.similarities, strict=True):
+        rows, columns = linear_sum_assignment(alignment[np.ix_(truth, tracks)] * sim, maximize=True)
+        over = sim[rows, columns] >= HOTA_THRESHOLDS[:, None] - _EPS  # (19, pairs)
+        matches[:, truth[rows], tracks[columns]] += over
+        true_positives += over.sum(axis=1)
+    detections = truth_count.sum() + track_count.sum()
+    det_a = true_positives / np.maximum(1, detections - true_positives)
+    jaccard = matches / np.maximum(1, truth_count[:, None] + track_count[None, :] - matches)
+    ass_a = (matches * jaccard).sum(axis=(1, 2)) / np.maximum(1, true_positives)
+    return float(np.sqrt(det_a * ass_a).mean()), float(det_a.mean()), float(ass_a.mean())
+
+
+def idf1(frames: Sequence[ScoredFrame], gate_m: float = 1.0) -> float:
+    """Returns the share of positions that one-to-one identities over the whole drive account for.
+
+    Ristani et al., "Performance Measures and a Data Set for Multi-Target, Multi-Camera Tracking" (2016).
+    """
+    return _idf1(_prepare(frames), gate_m)
+
+
+def _idf1(drive: _Drive, gate_m: float) -> float:
+    if drive.A == 0 and drive.B == 0:
+        return 1.0
+    least = float(similarity(np.array(gate_m)))
+    together = np.zeros((drive.A, drive.B))
+    positions = 0
+    for truth, tracks, sim in zip(drive.truth, drive.tracks, drive.similarities, strict=True):
+        together[np.ix_(truth, tracks)] += sim >= least - _EPS
+        positions += len(truth) + len(tracks)
+    rows, columns = linear_sum_assignment(together, maximize=True)
+    return float(2 * together[rows, columns].sum() / positions)
+
+
+@dataclass(frozen=True)
+class Clear:
+    """Counts of the CLEAR metrics over a drive."""
+
+    mota: float
+    id_switches: int
+    missed: int
+    false: int
+    localisation_m: float  # mean distance of matched pairs; 0 without any
+
+
+def clear(frames: Sequence[ScoredFrame], gate_m: float = 1.0) -> Clear:
+    """Returns MOTA and its counts: a pair of the frame before stays while within the gate, the rest is assigned anew.
+
+    Bernardin and Stiefelhagen, "Evaluating Multiple Object Tracking Performance: The CLEAR MOT Metrics" (2008). An
+    identity switch is a person whose track differs from the last one it had. Without people MOTA is 1 - false tracks.
+    """
+    return _clear(_prepare(frames), gate_m)
+
+
+def _clear(drive: _Drive, gate_m: float) -> Clear:
+    least = float(similarity(np.array(gate_m)))
+    last_ever, last_frame = np.full(drive.A, -1), np.full(drive.A, -1)
+    switches = missed = false = positions = pairs = 0
+    distance = 0.0
+    for truth, tracks, sim in zip(drive.truth, drive.tracks, drive.similarities, strict=True):
+        kept = last_frame[truth][:, None] == tracks[None, :]
+        score = np.where(sim >= least - _EPS, 1000.0 * kept + sim, 0.0)
+        rows, columns = linear_sum_assignment(score, maximize=True)
+        real = score[rows, columns] > 0
+        rows, columns = rows[real], columns[real]
+        people, ids = truth[rows], tracks[columns]
+        switches += int(((last_ever[people] >= 0) & (last_ever[people] != ids)).sum())
+        last_ever[people] = ids
+        last_frame[:] = -1
+        last_frame[people] = ids
+        positions += len(truth)
+        pairs += len(rows)
+        missed += len(truth) - len(rows)
+        false += len(tracks) - len(rows)
+        distance += float(((1 - sim[rows, columns]) * 2.0).sum())
+    mota = 1 - (missed + false + switches) / max(1, positions)
+    return Clear(mota, switches, missed, false, distance / max(1, pairs))
+
+
+def score(frames: Sequence[ScoredFrame], cutoff_m: float = 2.0, gate_m: float = 1.0) -> TrackingScore:
+    """Returns every score of a drive; ignored people, and the tracks on them, are left out first."""
+    seen = [drop_ignored(frame) for frame in frames]
+    drive = _prepare(seen)
+    hota_value, det_a, ass_a = _hota(drive)
+    counts = _clear(drive, gate_m)
+    return TrackingScore(
+        hota_value,
+        det_a,
+        ass_a,
+        _idf1(drive, gate_m),
+        counts.mota,
+        counts.id_switches,
+        counts.missed,
+        counts.false,
+        float(np.mean([ospa(frame.truth_m, frame.tracks_m, cutoff_m) for frame in seen] or [0.0])),
+        float(np.mean([gospa(frame.truth_m, frame.tracks_m, cutoff_m).total for frame in seen] or [0.0])),
+        counts.localisation_m,
+        len(seen),
+    )
