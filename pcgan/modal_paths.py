@@ -71,9 +71,8 @@ def _clusters(x: Tensor, y: Tensor, live: Tensor, eps_m: float) -> tuple[Tensor,
     reach = (distance2 <= eps_m * eps_m) & live.unsqueeze(1) & live
     for k in range(K):
         reach = reach | (reach[:, k].unsqueeze(1) & reach[k])
-    is_root = live.clone()
-    for k in range(1, K):
-        is_root[k] &= ~reach[k, :k].any(dim=0)
+    lower = torch.ones(K, K, dtype=torch.bool, device=x.device).tril(-1)[..., None, None]  # (K, K, 1, 1)
+    is_root = live & ~(reach & lower).any(dim=1)
     return reach & is_root.unsqueeze(1), is_root
 
 

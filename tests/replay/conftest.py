@@ -143,9 +143,7 @@ class Make:
 
     def boxes(self, at_ms: float, boxes=((900.0, 500.0, 960.0, 700.0),), frame="camera"):
         boxes = np.array(boxes, float).reshape(-1, 4)
-        return CameraDetections(
-            self.stamp(at_ms), frame, boxes, np.full(len(boxes), 0.9), ("person",) * len(boxes)
-        )
+        return CameraDetections(self.stamp(at_ms), frame, boxes, np.full(len(boxes), 0.9), ("person",) * len(boxes))
 
     def calibration(self, at_ms: float = 0.0, model="equidistant", coefficients=4, frame="camera"):
         K = np.array([[1176.0, 0, 962.0], [0, 1177.0, 612.0], [0, 0, 1]])
