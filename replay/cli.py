@@ -55,6 +55,7 @@ def replay(
         Path | None,
         typer.Option("--output", "-o", metavar="OUT.mcap", help="Predictions go here. [default: LOG.pcgan.mcap]"),
     ] = None,
+    merge: Annotated[bool, typer.Option("--merge", help="Copy the recording into OUT.mcap, too.")] = False,
     rrd: Annotated[Path | None, typer.Option("--rrd", metavar="FILE", help="Write a rerun recording, too.")] = None,
     view: Annotated[bool, typer.Option("--view", help="Open the rerun viewer and watch.")] = False,
     picture: Annotated[
@@ -109,6 +110,8 @@ def replay(
         _fail("--connect goes with --predictor external")
     if predictor is PredictorMode.external and not (connect or zenoh_config):
         connect = "tcp/127.0.0.1:7447"
+    if merge and salvage:
+        _fail("--merge copies intact recordings only: it cannot go with --salvage")
     if rrd and view:
         _fail("--rrd and --view exclude each other: write the recording and open it with rerun, or watch now")
     output = output or logs[0].with_name(f"{logs[0].stem}.pcgan.mcap")
@@ -128,7 +131,7 @@ def replay(
             if picture is not None:
                 busiest.offer(result)
 
-        done = record(run, output, shown, on_frame=on_frame)
+        done = record(run, output, shown, merge=merge, on_frame=on_frame)
     written = [output]
     if picture is not None and busiest.result is not None:
         draw_top_down(busiest.result, picture)
@@ -138,7 +141,7 @@ def replay(
     if summary is not None:
         _write_json(summary, done.as_json())
         written.append(summary)
-    print_summary(done, written, Console())
+    print_summary(done, written, _console(minimum_width=90))
     raise typer.Exit(_exit_code(done))
 
 
@@ -249,7 +252,7 @@ def info(
     if as_json:
         typer.echo(json.dumps(description, indent=2))
     else:
-        print_info(description, Console())
+        print_info(description, _console(minimum_width=120))
     raise typer.Exit(0 if description["usable"] else EXIT_ERROR)
 
 
@@ -356,6 +359,13 @@ def _progress() -> Progress:
     """Returns a progress bar for a terminal; in a pipe it says nothing."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     return Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal)
+
+
+def _console(minimum_width: int) -> Console:
+    """Returns standard output; in a pipe, and in a narrow terminal, tables keep their columns whole."""
+    console = Console()
+    console.width = max(console.width, minimum_width)
+    return console
 
 
 def _write_json(path: Path, value: object) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -49,9 +50,9 @@ def describe_log(
 def print_info(description: dict[str, Any], console: Console) -> None:
     """Prints a description as a table."""
     console.print(f"{', '.join(description['files'])}: {description['duration_s']:.1f} s", markup=False)
-    table = Table()
+    table = Table(box=box.SIMPLE_HEAD)
     for column in ("topic", "schema", "count", "Hz", "delay ms", "skew ms", "role"):
-        table.add_column(column, justify="left" if column in ("topic", "schema", "role") else "right", overflow="fold")
+        table.add_column(column, justify="left" if column in ("topic", "schema", "role") else "right", no_wrap=True)
     for row in description["topics"]:
         delay = "" if row["delay_ms"] is None else f"{row['delay_ms']['p50']:.0f} / {row['delay_ms']['p99']:.0f}"
         skew = "" if row["skew_ms"] is None else f"{row['skew_ms']['p50']:.1f} / {row['skew_ms']['p99']:.1f}"

@@ -4,7 +4,7 @@ Written as NAME.part and renamed when it is whole. It holds no clock, no path an
 """
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
@@ -16,6 +16,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from replay.errors import OutputError
 from replay.frame_result import FrameResult
+from replay.merge import copy_recording
 from replay.scene_update import scene_update_bytes
 from schemas import codec, topics
 from schemas.messages import PredictionFrame, TrackFrame, VehiclePose
@@ -29,10 +30,15 @@ class LogWriter:
 
     On a clean end, and on Ctrl-C, the file is closed and takes its final name. After any other error it stays as
     NAME.part. Raises OutputError if the file cannot be written.
+
+    Args:
+        path: the output.
+        merge: recordings to copy into it when it is closed; nothing of them is changed.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, merge: Sequence[Path] = ()):
         self._path = path
+        self._merge = merge
         self._part = path.with_name(path.name + ".part")
         self._lineage: Mapping[str, str] = {}
         self._settings = b""
@@ -70,11 +76,14 @@ class LogWriter:
     ) -> None:
         whole = error is None or isinstance(error, KeyboardInterrupt)
         try:
+            if whole:
+                for recording in self._merge:
+                    copy_recording(recording, self._writer)
             self._finish()
             if whole:
                 self._part.replace(self._path)
         except OSError as failure:
-            if whole:
+            if whole:  # else the first error is the one to hear about
                 raise OutputError(f"{self._path} could not be finished: {failure.strerror or failure}") from failure
         finally:
             self._stream.close()

@@ -17,6 +17,7 @@ from replay.log_writer import LogWriter
 from replay.rerun_view import NullView, View
 from replay.score import ReplayScore
 from replay.session import Replay
+from schemas.topics import OUTPUTS
 
 
 @dataclass
@@ -73,9 +74,10 @@ def record(
     output: Path | None = None,
     view: View | None = None,
     *,
+    merge: bool = False,
     on_frame: Callable[[FrameResult], None] = lambda _: None,
 ) -> Summary:
-    """Replays a log into an MCAP file and a view, and scores it.
+    """Replays a log into an MCAP file and a view, and scores it; with `merge` the file holds the recording, too.
 
     Ctrl-C, SIGTERM and a predictor that fails for good end it early: the outputs are then complete up to the last
     frame, and the summary's `stopped` holds the reason. Raises LogError or OutputError for anything else; the output
@@ -83,6 +85,9 @@ def record(
     """
     if output is not None and any(output.resolve() == path.resolve() for path in run.reader.paths):
         raise OutputError(f"{output} is the recording itself, which is never overwritten; choose another output")
+    held = {channel.topic for channel in run.reader.channels} & {topic.name for topic in OUTPUTS}
+    if merge and held:
+        raise OutputError(f"the recording already holds {', '.join(sorted(held))}; replay it without --merge")
     summary = Summary(salvage_losses=run.reader.losses.notes)
     score = ReplayScore()
     last_ns = run.start_ns
@@ -93,7 +98,9 @@ def record(
         interrupts = stack.enter_context(Interrupts())
         stack.enter_context(run)
         ready = time.perf_counter()
-        writer = stack.enter_context(LogWriter(output)) if output is not None else None
+        writer = (
+            stack.enter_context(LogWriter(output, run.reader.paths if merge else ())) if output is not None else None
+        )
         shown = stack.enter_context(view or NullView())
         try:
             for result in run:

@@ -4,7 +4,7 @@ Works while frames stream by. What it keeps is a few seconds of positions and, w
 numbers per person and frame for the tracking scores, which need the whole drive.
 """
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 
@@ -19,6 +19,8 @@ from tracking.metrics import ScoredFrame, score
 
 MAX_GAP_NS = 350_000_000  # a position is interpolated between measurements at most this far apart
 MATCH_M = 1.0  # a track further than this from everybody stands for nobody
+LONG_ENOUGH_SCANS = 20  # 2 s at 10 Hz: to be confirmed, and to have the 0.8 s of history a prediction takes
+FRAMES_AT_A_TIME = 10
 MIN_LIDAR_POINTS = 4  # whoever has fewer is neither missed nor, if tracked, a false track
 
 
@@ -55,7 +57,7 @@ class _Asked:
     """The network's predictions of one frame and the extrapolations beside them; A rows."""
 
     stamp_ns: int
-    dt_s: float
+    steps_ns: IntArray  # (A, P)  stamps of the predicted steps
     track_ids: IntArray  # (A,)
     person_ids: IntArray  # (A,)  whom the track stands for in the ground truth; -1 for nobody
     paths_m: FloatArray  # (A, P, 2)  most probable path
@@ -78,6 +80,9 @@ class ReplayScore:
         self._true: deque[Positions] = deque()
         self._frames: list[ScoredFrame] = []
         self._epoch = 0
+        self._scans_on: Counter[int] = Counter()  # person -> scans with enough LiDAR points
+        self._found: set[int] = set()  # people that a track stood for
+        self._foretold: set[int] = set()  # people that the network predicted
         self.predictions = 0
         self.fallbacks = 0
         self.against_tracks = {"predictor": Errors(), "tracker": Errors()}
@@ -98,6 +103,10 @@ class ReplayScore:
             self._true.append(true_positions(truth))
             person_of = match(tracks, truth)
             self._frames.append(_scored_frame(tracks, truth))
+            self._scans_on.update(truth.ids[truth.lidar_points >= MIN_LIDAR_POINTS].tolist())
+            self._found.update(person_of.tolist())
+            usual = [not prediction.fallback for prediction in result.predictions.predictions]
+            self._foretold.update(person_of[np.array(usual, bool)].tolist())
         self._ask(result, person_of)
         self._settle(stamp_ns)
 
@@ -118,9 +127,19 @@ class ReplayScore:
                 "scored": true["predictor"].scored,
                 "scored_share": _share(true["predictor"].scored, self.predictions),
                 "tracker": true["tracker"].as_json(),
+                **self._people(),
                 **asdict(score(self._frames)),
             }
         return figures
+
+    def _people(self) -> dict[str, int]:
+        """Returns how many people were seen for long enough, and how many of those were tracked and predicted."""
+        seen = {person for person, scans in self._scans_on.items() if scans >= LONG_ENOUGH_SCANS}
+        return {
+            "people_seen": len(seen),
+            "people_tracked": len(seen & self._found),
+            "people_predicted": len(seen & self._foretold),
+        }
 
     def _ask(self, result: FrameResult, person_of: IntArray) -> None:
         predictions = result.predictions.predictions
@@ -143,65 +162,94 @@ class ReplayScore:
         dt_s = result.predictions.dt_s
         ids = np.array([track.id for track in tracks], np.int64)
         extrapolated = extrapolate(states, covariances, dt_s, paths.shape[1])
-        self._asked.append(_Asked(result.tracks.stamp_ns, dt_s, ids, person_of[rows], paths, stacked, extrapolated))
+        stamp_ns, (A, P) = result.tracks.stamp_ns, paths.shape[:2]
+        steps_ns = stamp_ns + np.round(dt_s * 1e9 * np.arange(1, P + 1)).astype(np.int64)
+        every_step_ns = np.broadcast_to(steps_ns, (A, P))
+        self._asked.append(_Asked(stamp_ns, every_step_ns, ids, person_of[rows], paths, stacked, extrapolated))
 
     def _settle(self, now_ns: int | None) -> None:
-        """Scores the predictions whose last step lies far enough back; all of them without a present time."""
-        while self._asked:
-            asked = self._asked[0]
-            steps_ns = _steps_ns(asked)
-            if now_ns is not None and now_ns < steps_ns[-1] + MAX_GAP_NS:
-                break
-            self._asked.popleft()
-            _compare(asked, asked.track_ids, lookup(self._tracked, asked.track_ids, steps_ns), self.against_tracks)
+        """Scores the predictions whose last step lies far enough back; all of them without a present time.
+
+        Several frames at once: they are small, and numpy's cost is per call.
+        """
+        due = [asked for asked in self._asked if now_ns is None or asked.steps_ns[0, -1] + MAX_GAP_NS <= now_ns]
+        if due and (len(due) >= FRAMES_AT_A_TIME or now_ns is None):
+            for _ in due:
+                self._asked.popleft()
+            joined = _joined(due)
+            _compare(
+                joined, joined.track_ids, lookup(self._tracked, joined.track_ids, joined.steps_ns), self.against_tracks
+            )
             if self._true:
-                _compare(asked, asked.person_ids, lookup(self._true, asked.person_ids, steps_ns), self.against_truth)
+                _compare(
+                    joined,
+                    joined.person_ids,
+                    lookup(self._true, joined.person_ids, joined.steps_ns),
+                    self.against_truth,
+                )
         oldest_ns = self._asked[0].stamp_ns if self._asked else now_ns
         for seen in (self._tracked, self._true):
             while seen and oldest_ns is not None and seen[0].stamp_ns < oldest_ns:
                 seen.popleft()
 
 
-def _steps_ns(asked: _Asked) -> IntArray:
-    P = asked.paths_m.shape[1]
-    steps: IntArray = asked.stamp_ns + np.round(asked.dt_s * 1e9 * np.arange(1, P + 1)).astype(np.int64)
-    return steps
+def _joined(asked: Sequence[_Asked]) -> _Asked:
+    """Returns several frames' predictions as one."""
+    weights, means, sigmas, rhos = (np.concatenate(parts) for parts in zip(*(a.mixtures for a in asked), strict=True))
+    return _Asked(
+        asked[0].stamp_ns,
+        np.concatenate([a.steps_ns for a in asked]),
+        np.concatenate([a.track_ids for a in asked]),
+        np.concatenate([a.person_ids for a in asked]),
+        np.concatenate([a.paths_m for a in asked]),
+        (weights, means, sigmas, rhos),
+        tuple(np.concatenate(parts) for parts in zip(*(a.extrapolated for a in asked), strict=True)),
+    )
 
 
 def lookup(seen: Sequence[Positions], ids: IntArray, steps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
-    """Returns where `ids` (A,) were at `steps_ns` (P,), as (A, P, 2), and who was measured around every step (A,)."""
-    window = [frame for frame in seen if frame.stamp_ns <= steps_ns[-1] + MAX_GAP_NS]
-    A, F, P = len(ids), len(window), len(steps_ns)
-    if F == 0 or A == 0:
-        return np.zeros((A, P, 2)), np.zeros(A, bool)
-    order = np.argsort(ids, kind="stable")
+    """Returns where people or tracks were at given times, between their measurements.
+
+    Args:
+        seen: positions at rising stamps.
+        ids: (A,) who is looked for; the same one may be asked for more than once.
+        steps_ns: (A, P) when, or (P,) for all.
+
+    Returns:
+        positions (A, P, 2) in m, and (A,) who was measured around every step, at most MAX_GAP_NS apart; the positions
+        of others mean nothing.
+    """
+    steps_ns = np.broadcast_to(steps_ns, (len(ids), steps_ns.shape[-1]))
+    window = [frame for frame in seen if len(ids) and frame.stamp_ns <= steps_ns.max() + MAX_GAP_NS]
+    F = len(window)
+    if F == 0:
+        return np.zeros((*steps_ns.shape, 2)), np.zeros(len(ids), bool)
+    # who was where, as a table of F frames and U different ids
+    unique, column = np.unique(ids, return_inverse=True)
     everybody = np.concatenate([frame.ids for frame in window])
-    place = np.minimum(np.searchsorted(ids[order], everybody), A - 1)
-    wanted = ids[order][place] == everybody
-    row = np.repeat(np.arange(F), [len(frame.ids) for frame in window])[wanted]
-    column = order[place[wanted]]
-    positions = np.zeros((F, A, 2))
-    measured = np.zeros((F, A), bool)
-    positions[row, column] = np.concatenate([frame.positions_m for frame in window])[wanted]
-    measured[row, column] = np.concatenate([frame.measured for frame in window])[wanted]
-    stamps = np.array([frame.stamp_ns for frame in window], np.int64)
+    place = np.minimum(np.searchsorted(unique, everybody), len(unique) - 1)
+    wanted = unique[place] == everybody
+    row, place = np.repeat(np.arange(F), [len(frame.ids) for frame in window])[wanted], place[wanted]
+    positions = np.zeros((F, len(unique), 2))
+    measured = np.zeros((F, len(unique)), bool)
+    positions[row, place] = np.concatenate([frame.positions_m for frame in window])[wanted]
+    measured[row, place] = np.concatenate([frame.measured for frame in window])[wanted]
     # index of the last measured frame up to each frame, and of the first from it on
+    stamps = np.array([frame.stamp_ns for frame in window], np.int64)
     index = np.arange(F)[:, None]
-    last = np.maximum.accumulate(np.where(measured, index, -1), axis=0)  # (F, A)
+    last = np.maximum.accumulate(np.where(measured, index, -1), axis=0)  # (F, U)
     first = np.minimum.accumulate(np.where(measured, index, F)[::-1], axis=0)[::-1]
-    after = np.searchsorted(stamps, steps_ns)  # (P,)  first frame at or past the step
+    column = column[:, None]  # (A, 1)
+    after = np.searchsorted(stamps, steps_ns)  # (A, P)  first frame at or past the step
     before = np.searchsorted(stamps, steps_ns, side="right") - 1
-    first_after = np.where(after[:, None] < F, first[np.minimum(after, F - 1)], F)  # (P, A)
-    last_before = np.where(before[:, None] >= 0, last[np.maximum(before, 0)], -1)
+    first_after = np.where(after < F, first[np.minimum(after, F - 1), column], F)
+    last_before = np.where(before >= 0, last[np.maximum(before, 0), column], -1)
     inside = (first_after < F) & (last_before >= 0)
     low, high = np.where(inside, last_before, 0), np.where(inside, first_after, 0)
     gap_ns = stamps[high] - stamps[low]
-    known = inside & (gap_ns <= MAX_GAP_NS)
-    fraction = np.where(gap_ns > 0, (steps_ns[:, None] - stamps[low]) / np.maximum(gap_ns, 1), 0.0)
-    column = np.broadcast_to(np.arange(A), (P, A))
-    start, end = positions[low, column], positions[high, column]  # (P, A, 2)
-    found = start + fraction[..., None] * (end - start)
-    return found.swapaxes(0, 1), np.asarray(known.all(axis=0))
+    fraction = (steps_ns - stamps[low]) / np.maximum(gap_ns, 1)
+    start, end = positions[low, column], positions[high, column]  # (A, P, 2)
+    return start + fraction[..., None] * (end - start), np.asarray((inside & (gap_ns <= MAX_GAP_NS)).all(axis=1))
 
 
 def _compare(

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -18,17 +19,23 @@ def print_summary(summary: Summary, written: Sequence[Path], console: Console) -
     console.print(
         f"[bold]{summary.frames}[/] frames, [bold]{len(summary.track_ids)}[/] tracks, "
         f"[bold]{summary.predictions}[/] predictions ({summary.fallbacks} of them extrapolated) "
-        f"of {summary.log_s:.1f} s in {summary.wall_s:.1f} s{speed}"
+        f"of {summary.log_s:.1f} s in {summary.wall_s:.1f} s{speed}",
+        soft_wrap=True,
     )
     console.print(_errors_table(figures))
     truth = figures.get("ground_truth")
     if truth:
         console.print(
             f"tracks against ground truth: HOTA {truth['hota']:.3f}, MOTA {truth['mota']:.3f}, "
-            f"IDF1 {truth['idf1']:.3f}, GOSPA {truth['gospa_m']:.2f} m, {truth['id_switches']} id switches"
+            f"IDF1 {truth['idf1']:.3f}, GOSPA {truth['gospa_m']:.2f} m, {truth['id_switches']} id switches",
+            soft_wrap=True,
+        )
+        console.print(
+            f"of {truth['people_seen']} people seen for 2 s or more, {truth['people_tracked']} were tracked "
+            f"and {truth['people_predicted']} predicted by the network"
         )
     stages = ", ".join(f"{stage} {ms['p50']:.1f}/{ms['p99']:.1f}" for stage, ms in summary.latency_ms.items())
-    console.print(f"[dim]latency p50/p99 in ms: {stages}; model {figures['model'].get('name', '-')}[/]")
+    console.print(f"[dim]latency p50/p99 in ms: {stages}[/]", soft_wrap=True)
     if summary.restarts:
         console.print(f"the predictor was replaced {summary.restarts} times; nothing was lost")
     for line in summary.first_refusals[:5]:
@@ -47,9 +54,9 @@ def print_summary(summary: Summary, written: Sequence[Path], console: Console) -
 
 
 def _errors_table(figures: dict[str, Any]) -> Table:
-    table = Table(title="prediction errors: where the pedestrian was found later", title_justify="left")
-    for column in ("against", "who", "ADE m", "FDE m", "MHD m", "NLL", "scored"):
-        table.add_column(column, justify="left" if column in ("against", "who") else "right")
+    table = Table(title="prediction errors", title_justify="left", box=box.SIMPLE_HEAD)
+    for column in ("against", "predictor", "ADE m", "FDE m", "MHD m", "NLL", "scored"):
+        table.add_column(column, justify="left" if column in ("against", "predictor") else "right", no_wrap=True)
     rows = [("later tracks", figures)]
     if "ground_truth" in figures:
         rows.append(("ground truth", figures["ground_truth"]))
@@ -57,7 +64,7 @@ def _errors_table(figures: dict[str, Any]) -> Table:
         share = part.get("scored_share")
         scored = f"{part.get('scored', 0)} ({share:.0%})" if share is not None else "0"
         table.add_row(against, figures["model"].get("name", "predictor"), *_cells(part), scored)
-        table.add_row("", "tracker extrapolated", *_cells(part.get("tracker", {})), "")
+        table.add_row("", "extrapolated track", *_cells(part.get("tracker", {})), "")
     return table
 
 

@@ -1,0 +1,94 @@
+"""How fast a replay is, and whether its memory grows with the log.
+
+python -m benchmarks.realtime [--pedestrians 30] [--minutes 1 10] [--repeats 3] [--json F]
+
+Each replay is the command itself, in a process of its own with its predictor, on a simulated drive without --rrd.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from replay.simulator import simulate
+
+_MEASURED = """
+import resource, sys
+from replay.cli import main
+sys.argv = ["pcgan", *sys.argv[1:]]
+try:
+    main()
+finally:
+    own = resource.getrusage(resource.RUSAGE_SELF)
+    child = resource.getrusage(resource.RUSAGE_CHILDREN)
+    print("rusage", own.ru_maxrss, child.ru_maxrss, own.ru_utime + own.ru_stime, child.ru_utime + child.ru_stime)
+"""
+
+
+def main() -> None:
+    """Measures, prints a table and writes JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pedestrians", type=int, default=30)
+    parser.add_argument("--minutes", type=float, nargs="+", default=[1.0])
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    rows = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for minutes in arguments.minutes:
+            log = folder / "drive.mcap"
+            simulate(log, clip=None, vehicle=None, pedestrians=arguments.pedestrians, duration_s=60 * minutes, seed=1)
+            rows += [{"minutes": minutes, **measure(log, folder)} for _ in range(arguments.repeats)]
+    show(rows)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+def measure(log: Path, folder: Path) -> dict[str, Any]:
+    """Replays once and returns speed, memory and CPU time."""
+    summary = folder / "summary.json"
+    command = [sys.executable, "-c", _MEASURED, "replay", str(log), "-o", str(folder / "out.mcap")]
+    done = subprocess.run(
+        [*command, "--json", str(summary)], capture_output=True, text=True, check=True, env={**os.environ}
+    )
+    _, own_kib, child_kib, own_s, child_s = done.stdout.split("rusage")[-1].join(["rusage ", ""]).split()
+    figures = json.loads(summary.read_text())
+    return {
+        "frames": figures["frames"],
+        "tracks_per_frame": figures["predictions"] / figures["frames"],
+        "realtime_factor": figures["realtime_factor"],
+        "wall_s": figures["wall_s"],
+        "startup_s": figures["startup_s"],
+        "replay_cpu_ms_per_frame": 1e3 * float(own_s) / figures["frames"],
+        "predictor_cpu_ms_per_frame": 1e3 * float(child_s) / figures["frames"],
+        "replay_peak_mib": int(own_kib) / 1024,
+        "predictor_peak_mib": int(child_kib) / 1024,
+        "latency_ms": figures["latency_ms"],
+    }
+
+
+def show(rows: list[dict[str, Any]]) -> None:
+    """Prints the rows as a table."""
+    table = Table("minutes", "tracks a frame", "times real time", "replay CPU ms", "predictor CPU ms", "replay MiB")
+    for row in rows:
+        table.add_row(
+            f"{row['minutes']:g}",
+            f"{row['tracks_per_frame']:.1f}",
+            f"{row['realtime_factor']:.1f}",
+            f"{row['replay_cpu_ms_per_frame']:.2f}",
+            f"{row['predictor_cpu_ms_per_frame']:.2f}",
+            f"{row['replay_peak_mib']:.0f}",
+        )
+    Console(width=120).print(table)
+
+
+if __name__ == "__main__":
+    main()
