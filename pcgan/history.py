@@ -24,12 +24,15 @@ def track_positions(tracks: Sequence[Track], times_ns: IntArray) -> tuple[FloatA
     if not tracks:
         return np.zeros((0, len(times_ns), 2)), np.zeros(0, bool)
     histories = [track.history for track in tracks]
-    counts = np.array([len(history.stamps_ns) for history in histories])
-    seen = ~np.concatenate([history.coasting for history in histories])
-    stamps = np.concatenate([history.stamps_ns for history in histories])[seen]
-    states = np.concatenate([history.states for history in histories])[seen]
-    owners = np.repeat(np.arange(len(tracks)), counts)[seen]
-    return _interpolate(stamps, states[:, :2], owners, len(tracks), times_ns)
+    counts = [len(history.stamps_ns) for history in histories]
+    coasting = np.concatenate([history.coasting for history in histories])
+    stamps = np.concatenate([history.stamps_ns for history in histories])
+    positions = np.concatenate([history.states for history in histories])[:, :2]
+    owners = np.repeat(np.arange(len(tracks)), counts)
+    if coasting.any():
+        seen = ~coasting
+        stamps, positions, owners = stamps[seen], positions[seen], owners[seen]
+    return _interpolate(stamps, positions, owners, len(tracks), times_ns)
 
 
 def vehicle_states(history: VehicleHistory, times_ns: IntArray) -> FloatArray | None:

@@ -23,8 +23,8 @@ from pcgan.mixture_density import RAW_PER_COMPONENT, GaussianMixture, mixture_fr
 from pcgan.modal_paths import cluster_eps_m
 
 RECIPES = ("paper", "best")
-_FAR_M = 5.0  # relative positions d enter as d / (5 m + |d|): near ones in detail, far ones as a direction
-_SLOW_MPS = 1e-6
+FAR_M = 5.0  # relative positions d enter as d / (5 m + |d|): near ones in detail, far ones as a direction
+SLOW_MPS = 1e-6
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class Generator(nn.Module):
         """(..., 2) -> (..., 2, 2): rotation from a pedestrian's heading frame; the identity for `paper` and at rest."""
         speed = velocity.norm(dim=-1, keepdim=True)
         ahead = torch.tensor([1.0, 0.0], dtype=velocity.dtype, device=velocity.device)
-        heading = torch.where(speed > _SLOW_MPS, velocity / speed.clamp_min(_SLOW_MPS), ahead) if self.best else (
+        heading = torch.where(speed > SLOW_MPS, velocity / speed.clamp_min(SLOW_MPS), ahead) if self.best else (
             ahead.expand_as(velocity)
         )  # fmt: skip
         c, s = heading.unbind(-1)
@@ -232,7 +232,7 @@ class Generator(nn.Module):
         offset = present.unsqueeze(-3) - present.unsqueeze(-2)  # (..., A, A, 2) x_j - x_i
         motion = velocity.unsqueeze(-3) - velocity.unsqueeze(-2)
         distance = offset.norm(dim=-1, keepdim=True)  # (..., A, A, 1)
-        turned = torch.cat([offset / (_FAR_M + distance), motion], dim=-2) @ turn  # (..., A, 2A, 2)
+        turned = torch.cat([offset / (FAR_M + distance), motion], dim=-2) @ turn  # (..., A, 2A, 2)
         return torch.cat([turned[..., :A, :], turned[..., A:, :], 1 / (1 + distance)], dim=-1)
 
     def _vehicle_features(
@@ -257,6 +257,6 @@ class Generator(nn.Module):
             return -offset * seen, seen
         motion = last[..., 2:] - velocity
         change = (last[..., 2:] - first[..., 2:]).expand_as(motion)
-        nearness = 1 / (_FAR_M + offset.norm(dim=-1, keepdim=True))
+        nearness = 1 / (FAR_M + offset.norm(dim=-1, keepdim=True))
         features = (torch.stack([offset * nearness, motion * 0.2, change], dim=-2) @ turn).flatten(-2)  # (..., A, 6)
         return features * seen, seen

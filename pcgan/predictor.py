@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from pcgan import checkpoint, mixture_density
+from pcgan import checkpoint, inference
 from pcgan.extrapolation import extrapolate
 from pcgan.history import track_positions, vehicle_states
-from pcgan.modal_paths import modal_paths
+from pcgan.inference import NumpyGenerator
 from pcgan.model import Generator
 from schemas.messages import (
     FloatArray,
@@ -39,17 +38,15 @@ class Predictor:
     """Answers every TrackFrame with a PredictionFrame of the same sequence and stamp.
 
     The answer depends on the frame and the weights alone, bit for bit on one machine: one frame is one forward pass on
-    one torch thread. Building a predictor sets torch to one thread for the whole process, which is also fastest for
-    batches this small. Call `step` from one thread only.
+    the calling thread, in numpy (`inference.py`). The weights are copied: training a generator on changes no predictor.
     """
 
     def __init__(self, generator: Generator, model_name: str, checksum: str):
-        torch.set_num_threads(1)
         self.model_name = model_name
         self.checksum = checksum  # SHA-256 of the weights' file
         self.config = generator.config
         self.dt_s = generator.config.dt_s
-        self._generator = generator.eval()
+        self._generator = NumpyGenerator(generator)
         ages = np.arange(self.config.observed_steps - 1, -1, -1)
         self._ages_ns = np.round(ages * self.dt_s * 1e9).astype(np.int64)  # (T,) oldest first
 
@@ -86,29 +83,27 @@ class Predictor:
         answered = tuple(prediction for prediction in predictions if prediction is not None)
         return PredictionFrame(frame.sequence, frame.stamp_ns, frame.frame_id, self.model_name, self.dt_s, answered)
 
-    @torch.inference_mode()
     def _forward(self, positions: FloatArray, states: FloatArray, vehicle: FloatArray | None) -> _Arrays:
         """(A, T, 2), (A, 4), (T, 4) or None, float64 -> the network's predictions."""
         present = positions[:, -1]  # (A, 2)
         origin = present.mean(axis=0)  # what the network sees is small, so float32 is fine from here on
-        observed = torch.from_numpy((positions - origin).astype(np.float32))
-        velocity = torch.from_numpy(states[:, 2:].astype(np.float32))
+        observed = np.ascontiguousarray((positions - origin).transpose(2, 1, 0), np.float32)  # (2, T, A)
+        velocity = np.ascontiguousarray(states[:, 2:].T, np.float32)  # (2, A)
         seen = None
-        if vehicle is not None:
-            seen = torch.from_numpy((vehicle - [origin[0], origin[1], 0, 0]).astype(np.float32))
-        neighbours = torch.ones(len(present), len(present), dtype=torch.bool)
-        turn = self._generator.scene_from_local(velocity)  # (A, 2, 2)
-        local = self._generator.local_mixture(observed, velocity, neighbours, seen, turn)
-        paths = modal_paths(local.weights, local.means, self.config.eps_m)
-        turned = mixture_density.rotate(local, turn.unsqueeze(1))
-        points = (paths.points @ turn.transpose(1, 2).unsqueeze(1)).numpy()  # (A, K, P, 2)
+        if vehicle is not None and np.isfinite(vehicle).all():
+            seen = (vehicle - [origin[0], origin[1], 0, 0]).astype(np.float32)
+        heading = self._generator.heading(velocity)
+        local = self._generator.local_mixture(observed, velocity, seen, heading)
+        probabilities, points = inference.modal_paths(local.weights, local.means_m, self.config.eps_m)
+        scene = inference.to_scene(local, heading)
+        where = present.T[:, None, None]  # (2, 1, 1, A)
         return _Arrays(
-            probabilities=paths.probabilities.numpy(),
-            paths_m=points + present[:, None, None],
-            weights=turned.weights.numpy(),
-            means_m=(turned.means.numpy() + present[:, None, None]).astype(np.float32),
-            sigmas_m=turned.log_sigmas.exp().numpy(),
-            rhos=turned.rhos.numpy(),
+            probabilities=probabilities.T,
+            paths_m=np.ascontiguousarray((inference.points_to_scene(points, heading) + where).T),
+            weights=np.ascontiguousarray(scene.weights.T),
+            means_m=np.ascontiguousarray((scene.means_m + where).T, np.float32),
+            sigmas_m=np.ascontiguousarray(scene.sigmas_m.T),
+            rhos=np.ascontiguousarray(scene.rhos.T),
         )
 
     @staticmethod

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from replay.errors import ReplayError
 from replay.frame_result import FrameResult
 from replay.interrupts import Interrupted
-from replay.record import Summary, record
+from replay.record import Summary, record, refuse_overwriting
 
 app = typer.Typer(
     name="pcgan",
@@ -115,9 +115,11 @@ def replay(
     if rrd and view:
         _fail("--rrd and --view exclude each other: write the recording and open it with rerun, or watch now")
     output = output or logs[0].with_name(f"{logs[0].stem}.pcgan.mcap")
+    refuse_overwriting(logs, *(path for path in (rrd, picture, summary) if path is not None))
     settings = ReplaySettings(start_s=start, duration_s=duration, topics=_remaps(topic))
     choice = PredictorChoice(predictor.value, model, connect, zenoh_config, namespace)
-    run = Replay(logs, settings, choice, window=window, rate=rate, strict=strict, salvage=salvage)
+    images = rrd is not None or view
+    run = Replay(logs, settings, choice, window=window, rate=rate, strict=strict, salvage=salvage, images=images)
     for name in run.roles.missing:
         errors.print(f"note: the log has no {name}", markup=False)
     recording_id = "+".join(path.stem for path in logs)

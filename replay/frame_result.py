@@ -20,7 +20,7 @@ class FrameResult:
     measurements: Measurements  # fused, odometry frame
     tracks: TrackFrame
     predictions: PredictionFrame
-    images: Mapping[str, CompressedImage]  # camera name -> the logged image nearest the scan; empty without images
+    images: Mapping[str, CompressedImage]  # camera name -> the logged image nearest the scan; if asked for
     ground_truth: GroundTruthFrame | None  # of this scan, where the log holds it
 
     @property

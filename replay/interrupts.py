@@ -1,6 +1,7 @@
 """Ctrl-C and SIGTERM, kept out of the middle of a write."""
 
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -16,7 +17,10 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interrupts:
-    """While entered, turns SIGINT and SIGTERM into `Interrupted`; inside `shield()` only at its end."""
+    """While entered, turns SIGINT and SIGTERM into `Interrupted`; inside `shield()` only at its end.
+
+    Outside the main thread it leaves signals alone.
+    """
 
     def __init__(self) -> None:
         self._shielded = False
@@ -25,8 +29,9 @@ class Interrupts:
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
-        for signum in (signal.SIGINT, signal.SIGTERM):
-            self._previous[signum] = signal.signal(signum, self._on_signal)
+        if threading.current_thread() is threading.main_thread():  # Python lets no other thread set handlers
+            for signum in (signal.SIGINT, signal.SIGTERM):
+                self._previous[signum] = signal.signal(signum, self._on_signal)
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -3,10 +3,12 @@
 Memory is bounded by the chunks that overlap in time, whatever the length of the log. Files are opened for reading only.
 """
 
+import errno
 import hashlib
 import heapq
 import io
 import struct
+import zlib
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -20,7 +22,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, SeekingReader
-from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema, Statistics
 from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
 
 from replay.errors import LogError
@@ -107,13 +109,14 @@ class _IndexedFile:
 
     def __init__(self, path: Path):
         self._path = path
-        try:
-            with path.open("rb") as stream:
+        with path.open("rb") as stream:
+            try:
                 summary = SeekingReader(stream, validate_crcs=True).get_summary()
-        except OSError:
-            raise
-        except Exception as error:  # what mcap raises on damage has no common base
-            raise LogError(f"{path} is not a readable MCAP file ({_described(path, error)}){_HINT}") from error
+                _check_summary_crc(stream)
+            except Exception as error:  # what mcap raises on damage has no common base
+                if isinstance(error, OSError) and error.errno != errno.EINVAL:  # that is a seek before the beginning
+                    raise
+                raise LogError(f"{path} is not a readable MCAP file ({_described(path, error)}){_HINT}") from error
         if summary is None or summary.statistics is None:
             raise LogError(f"{path} has no summary section: the recording was not closed{_HINT}")
         counts = summary.statistics.channel_message_counts
@@ -190,6 +193,7 @@ class _SalvagedFile:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         counts: Counter[int] = Counter()
+        recorded = 0
         self.start_ns, self.end_ns = 2**63, 0
         for record in self._records(losses):
             if isinstance(record, Schema):
@@ -200,6 +204,11 @@ class _SalvagedFile:
                 counts[record.channel_id] += 1
                 self.start_ns = min(self.start_ns, record.log_time)
                 self.end_ns = max(self.end_ns, record.log_time)
+            elif isinstance(record, Statistics):
+                recorded = record.message_count
+        if not losses.notes and counts.total() < recorded:
+            # a damaged record header hides a whole chunk without a trace of it
+            losses.notes.append(f"{path.name}: {recorded - counts.total()} of {recorded} recorded messages are missing")
         if undeclared := sum(count for channel, count in counts.items() if channel not in self._channels):
             losses.notes.append(f"{path.name}: {undeclared} messages of topics whose declaration is lost")
         self.channels = tuple(
@@ -257,6 +266,7 @@ class _SalvagedFile:
 
 
 _RECORD = struct.Struct("<BQ")  # opcode, length of what follows
+_FOOTER_END = struct.Struct("<QQI8s")  # summary start, summary offset start, CRC; then the magic that ends a file
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time, before the data
 _log_time = attrgetter("log_time_ns")
 _HINT = "; try --salvage"
@@ -275,6 +285,20 @@ def _described(path: Path, error: Exception) -> str:
     name = type(error).__name__
     known = {"EndOfFile": "it ends early", "RecordLengthLimitExceeded": "it is cut short or damaged"}
     return known.get(name) or f"{str(error) or name}"
+
+
+def _check_summary_crc(stream: IO[bytes]) -> None:
+    """Raises ValueError if the summary section is not what was written; mcap reads it unchecked.
+
+    The CRC is the footer's last field, and covers all from the beginning of the summary up to itself.
+    """
+    stream.seek(-_FOOTER_END.size, io.SEEK_END)
+    summary_start, _, crc, _ = _FOOTER_END.unpack(stream.read(_FOOTER_END.size))
+    if summary_start and crc:
+        end = stream.seek(0, io.SEEK_END) - _FOOTER_END.size + 16  # the two offsets before the CRC are covered, too
+        stream.seek(summary_start)
+        if zlib.crc32(stream.read(end - summary_start)) != crc:
+            raise ValueError("the summary's CRC is wrong")
 
 
 def _chunk_messages(chunk: Chunk) -> Iterator[tuple[int, int, bytes]]:

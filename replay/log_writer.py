@@ -3,6 +3,8 @@
 Written as NAME.part and renamed when it is whole. It holds no clock, no path and no random number.
 """
 
+import contextlib
+import errno
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -46,6 +48,8 @@ class LogWriter:
         self._sequence = 0
         self._last_ns = 0
         try:
+            if path.is_dir():
+                raise IsADirectoryError(errno.EISDIR, "Is a directory")
             path.parent.mkdir(parents=True, exist_ok=True)
             self._stream: IO[bytes] = self._part.open("wb")
         except OSError as error:
@@ -86,7 +90,8 @@ class LogWriter:
             if whole:  # else the first error is the one to hear about
                 raise OutputError(f"{self._path} could not be finished: {failure.strerror or failure}") from failure
         finally:
-            self._stream.close()
+            with contextlib.suppress(OSError):  # on a full disk closing fails again, with nothing new to say
+                self._stream.close()
 
     def _finish(self) -> None:
         if self._settings:

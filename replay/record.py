@@ -3,7 +3,7 @@
 import concurrent.futures
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -83,8 +83,8 @@ def record(
     frame, and the summary's `stopped` holds the reason. Raises LogError or OutputError for anything else; the output
     then stays as NAME.part.
     """
-    if output is not None and any(output.resolve() == path.resolve() for path in run.reader.paths):
-        raise OutputError(f"{output} is the recording itself, which is never overwritten; choose another output")
+    if output is not None:
+        refuse_overwriting(run.reader.paths, output)
     held = {channel.topic for channel in run.reader.channels} & {topic.name for topic in OUTPUTS}
     if merge and held:
         raise OutputError(f"the recording already holds {', '.join(sorted(held))}; replay it without --merge")
@@ -131,6 +131,16 @@ def record(
     summary.latency_ms = run.clock.as_json()
     summary.score = score.as_json()
     return summary
+
+
+def refuse_overwriting(recordings: Sequence[Path], *outputs: Path) -> None:
+    """Raises OutputError if an output, or the part it is written as, is one of the recordings."""
+    for output in outputs:
+        for written in (output, output.with_name(output.name + ".part")):
+            if any(written.resolve() == path.resolve() for path in recordings):
+                raise OutputError(
+                    f"{written} is the recording itself, which is never overwritten; choose another output"
+                )
 
 
 def _count(summary: Summary, result: FrameResult) -> None:

@@ -1,5 +1,6 @@
 """Which topic of a recording plays which role, and a clear word where one is missing or of the wrong kind."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -41,6 +42,10 @@ def assign_roles(channels: Sequence[ChannelInfo], remaps: Mapping[str, str] | No
     if absent := sorted(set(remaps.values()) - set(by_name)):
         raise LogError(f"the log has no topic {absent[0]}; its topics are {_listed(sorted(by_name))}")
 
+    taken = Counter(name for default, name in remaps.items() if default != name)
+    taken.update(topic.name for topic in topics.INPUTS if topic.name in by_name and topic.name not in remaps)
+    if shared := sorted(name for name, roles in taken.items() if roles > 1):
+        raise LogError(f"{shared[0]} cannot play two roles; remap what it is read as by default, too")
     topic_of = {}
     for topic in topics.INPUTS:
         channel = by_name.get(remaps.get(topic.name, topic.name))

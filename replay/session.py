@@ -23,6 +23,7 @@ from schemas.codec import CodecError
 from tracking.pipeline import TrackingSettings
 
 WARM_UP_NS = 4_000_000_000  # what the tracker sees, unpublished, before --start
+LEAD_IN_NS = 1_000_000_000  # poses and boxes from before the first scan
 STATIC_SEARCH_NS = 10_000_000_000  # how far into a log its transforms and calibrations are looked for
 PredictorMode = Literal["spawned", "external", "inline"]
 
@@ -61,6 +62,8 @@ class PredictorChoice:
 class Replay:
     """One run over one log. Entering starts the predictor; iterating yields results; leaving ends the predictor.
 
+    With `images`, results carry the logged camera images nearest each scan; they are not read otherwise.
+
     Raises LogError before anything is started if the log cannot be used.
     """
 
@@ -74,6 +77,7 @@ class Replay:
         rate: float | None = None,
         strict: bool = False,
         salvage: bool = False,
+        images: bool = False,
     ):
         if window < 1:
             raise ValueError(f"a window holds at least one frame, got {window}")
@@ -90,6 +94,7 @@ class Replay:
             length_s = (self.reader.end_ns - self.reader.start_ns) / 1e9
             raise LogError(f"nothing to replay from {self.settings.start_s:g} s: the log lasts {length_s:.1f} s")
         self._choice = predictor or PredictorChoice()
+        self._images = images
         self._window = window
         self._pacer = Pacer(rate)
         self._predictor: AskedPredictor | None = None
@@ -126,14 +131,21 @@ class Replay:
         names = self.roles.default_of
         if "/tf_static" in self.roles.topic_of:
             names.pop(self.roles.topic_of.get("/tf", ""), None)  # mounts are static; the pose has a topic of its own
+        if not self._images:
+            names = {name: default for name, default in names.items() if not default.endswith("/image")}
         cameras = {name: _camera_of(default) for name, default in names.items()}
-        for message in self._static_messages():
-            for decoded in self._decoded(message):
-                sync.preload(decoded, cameras[message.topic])
         from_ns = max(self.reader.start_ns, self.start_ns - WARM_UP_NS)
+        for message in self._static_messages():
+            # what the stream below comes to again is counted there
+            refusals = self.refusals if message.log_time_ns < from_ns - LEAD_IN_NS else Refusals()
+            for decoded in _decoded(message, refusals):
+                sync.take_static(message.topic, cameras[message.topic], decoded, refusals)
         elapsed, since = 0.0, time.perf_counter()
-        for message in self.reader.messages(set(names), from_ns, self.end_ns):
-            for decoded in self._decoded(message):
+        scans = self.roles.topic_of["/velodyne/front/clusters"]
+        for message in self.reader.messages(set(names), from_ns - LEAD_IN_NS, self.end_ns):
+            if message.topic == scans and message.log_time_ns < from_ns:
+                continue  # what is read this early only surrounds the first scan
+            for decoded in _decoded(message, self.refusals):
                 for frame in sync.push(message.topic, cameras[message.topic], message.log_time_ns, decoded):
                     self.clock.add("read", elapsed + time.perf_counter() - since)
                     yield frame
@@ -156,18 +168,19 @@ class Replay:
             end_ns = self.reader.start_ns + STATIC_SEARCH_NS
             yield from self.reader.messages(wanted, None, end_ns)
 
-    def _decoded(self, message: RawMessage) -> tuple[object, ...]:
-        """Returns the message's dataclasses; one that does not decode, or makes no sense, is refused and counted."""
-        try:
-            decoded = DECODERS[message.schema_name][1](message.data)
-        except KeyError:
-            reason = f"schema {message.schema_name}"
-        except CodecError as error:
-            reason = str(error)
-        else:
-            return decoded if isinstance(decoded, tuple) else (decoded,)
-        self.refusals.add(message.topic, message.log_time_ns, reason)
-        return ()
+
+def _decoded(message: RawMessage, refusals: Refusals) -> tuple[object, ...]:
+    """Returns a message's dataclasses; one that does not decode, or makes no sense, is refused and counted."""
+    try:
+        decoded = DECODERS[message.schema_name][1](message.data)
+    except KeyError:
+        reason = f"schema {message.schema_name}"
+    except CodecError as error:
+        reason = str(error)
+    else:
+        return decoded if isinstance(decoded, tuple) else (decoded,)
+    refusals.add(message.topic, message.log_time_ns, reason)
+    return ()
 
 
 def replay(
@@ -182,7 +195,7 @@ def replay(
         paths: an MCAP file, or several that belong together (a split recording, a sidecar with detections).
         settings: what changes results; the defaults fit the USyd vehicle.
         predictor: "inline" predicts in this process, "spawned" in a process of its own.
-        options: `window`, `rate`, `strict`, `salvage`, as of `Replay`.
+        options: `window`, `rate`, `strict`, `salvage`, `images`, as of `Replay`.
 
     Raises LogError if the log cannot be used, PredictorError if there is no predictor.
     """

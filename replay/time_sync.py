@@ -101,21 +101,25 @@ class TimeSync:
         self._ground_truth: deque[GroundTruthFrame] = deque(maxlen=64)
         self._last_released_ns = 0
 
-    def preload(self, message: object, camera: str | None) -> None:
-        """Takes a calibration or transform from the beginning of the log, ahead of the stream."""
-        if isinstance(message, CameraCalibration) and camera is not None:
+    def take_static(self, topic: str, camera: str | None, message: object, refusals: Refusals) -> None:
+        """Takes a calibration or transform; at the beginning of a log ahead of the stream, and then as they come."""
+        if isinstance(message, Transform):
+            self._tree.add(message)
+        elif isinstance(message, CameraCalibration) and camera is not None:
             known = self._calibrations.get(camera)
-            if known is None or not _same_camera(known, message):  # logged again and again, and costly to set up
+            if known is not None and _same_camera(known, message):
+                return  # logged again and again, and costly to set up
+            try:
                 self._models[camera] = (CameraModel.from_calibration(message), message.frame_id)
                 self._calibrations[camera] = message
-        elif isinstance(message, Transform):
-            self._tree.add(message)
+            except CalibrationError as error:
+                refusals.add(topic, message.stamp_ns, "unusable calibration", str(error))
 
     def push(self, topic: str, camera: str | None, log_time_ns: int, message: object) -> Iterator[SyncedFrame]:
         """Takes the next message in log-time order; yields the frames it completes."""
         self._last_log_time_ns = max(self._last_log_time_ns, log_time_ns)
         if isinstance(message, Transform | CameraCalibration):
-            self._take_static(topic, camera, message)
+            self.take_static(topic, camera, message, self._refusals)
         else:
             stamp_ns: int = message.stamp_ns  # type: ignore[attr-defined]
             verdict = self._guard(topic).check(stamp_ns, log_time_ns)
@@ -128,7 +132,8 @@ class TimeSync:
                 self._start_epoch((stamp_ns, log_time_ns))
                 self._guard(topic).check(stamp_ns, log_time_ns)
             yield from self._take_stamped(topic, camera, log_time_ns, message)
-        yield from self._release(lambda scan_ns, arrived_ns: self._complete(scan_ns) or self._waited(arrived_ns))
+        if self._scans:
+            yield from self._release(lambda scan_ns, arrived_ns: self._complete(scan_ns) or self._waited(arrived_ns))
 
     def flush(self) -> Iterator[SyncedFrame]:
         """Yields what is still waiting, at the end of the log or of an epoch."""
@@ -136,12 +141,6 @@ class TimeSync:
 
     def _guard(self, topic: str) -> StampGuard:
         return self._guards.setdefault(topic, StampGuard(self._reference))
-
-    def _take_static(self, topic: str, camera: str | None, message: Transform | CameraCalibration) -> None:
-        try:
-            self.preload(message, camera)
-        except CalibrationError as error:
-            self._refusals.add(topic, message.stamp_ns, "unusable calibration", str(error))
 
     def _take_stamped(self, topic: str, camera: str | None, log_time_ns: int, message: object) -> Iterator[SyncedFrame]:
         if isinstance(message, CameraDetections) and camera in self._cameras:

@@ -438,6 +438,8 @@ def _encode_prediction_frame(frame: PredictionFrame) -> Message:
 def _decode_prediction_frame(message: pb.PredictionFrame) -> PredictionFrame:
     _check_stamp(message)
     _require(message.dt_s > 0 and math.isfinite(message.dt_s), message, f"dt_s {message.dt_s} is not positive")
+    ids = {prediction.track_id for prediction in message.predictions}
+    _require(len(ids) == len(message.predictions), message, "has two predictions of one track")
     predictions = _decode_predictions(message.predictions) if message.predictions else ()
     return PredictionFrame(
         message.sequence, message.stamp_ns, message.frame_id, message.model, message.dt_s, predictions
@@ -473,17 +475,20 @@ def _decode_predictions(predictions: Sequence[pb.Prediction]) -> tuple[Predictio
 def _decode_mixtures(messages: Sequence[pb.Mixture]) -> list[Mixture]:
     wires = [_packed_fields(message.SerializeToString()) for message in messages]
     columns, lengths = _table(pb.Mixture.DESCRIPTOR, wires, ("weight", "x", "y", "sigma_x", "sigma_y", "rho"))
-    _require(bool((columns[3:5] > 0).all()), messages[0], "has a sigma that is not positive")
+    weights, rhos = columns[0], columns[5]
+    _require(float(columns[3:5].min(initial=1)) > 0, messages[0], "has a sigma that is not positive")
+    _require(float(weights.min(initial=0)) >= 0, messages[0], "has a negative weight")
+    _require(float(np.abs(rhos).max(initial=0)) < 1, messages[0], "has a correlation outside -1 to 1")
     mixtures = []
     means, sigmas = np.ascontiguousarray(columns[1:3].T), np.ascontiguousarray(columns[3:5].T)  # (S, 2) each
-    for message, weights, mean, sigma, rhos in zip(
-        messages, *(_split(part, lengths) for part in (columns[0], means, sigmas, columns[5])), strict=True
+    for message, weight, mean, sigma, rho in zip(
+        messages, *(_split(part, lengths) for part in (weights, means, sigmas, rhos)), strict=True
     ):
         K = message.components
-        _require(K > 0 and len(weights) % K == 0, message, f"has {len(weights)} entries for {K} components")
+        _require(K > 0 and len(weight) % K == 0, message, f"has {len(weight)} entries for {K} components")
         steps = (-1, K)
         mixtures.append(
-            Mixture(weights.reshape(steps), mean.reshape(*steps, 2), sigma.reshape(*steps, 2), rhos.reshape(steps))
+            Mixture(weight.reshape(steps), mean.reshape(*steps, 2), sigma.reshape(*steps, 2), rho.reshape(steps))
         )
     return mixtures
 

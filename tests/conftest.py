@@ -1,8 +1,9 @@
 """Builders that several packages' tests share: a random-initialised model, small drives, hand-made recordings."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import pytest
@@ -101,6 +102,7 @@ def edit_log(tmp_path):
         source: Path,
         change: Callable[[list[tuple[str, int, bytes]]], Iterable[tuple[str, int, bytes]]],
         name: str = "edited.mcap",
+        topics: Mapping[str, str] = MappingProxyType({}),  # old name -> new name
     ) -> Path:
         found, schema_of, declared = [], {}, {}
         with source.open("rb") as stream:
@@ -116,7 +118,7 @@ def edit_log(tmp_path):
                 if topic not in declared:
                     schema = schema_of[topic]
                     identifier = writer.register_schema(schema.name, schema.encoding, schema.data)
-                    declared[topic] = writer.register_channel(topic, "protobuf", identifier)
+                    declared[topic] = writer.register_channel(topics.get(topic, topic), "protobuf", identifier)
                 writer.add_message(declared[topic], log_time_ns, data, log_time_ns, numbers[topic])
                 numbers[topic] += 1
             writer.finish()

@@ -181,7 +181,7 @@ def _ask_cameras(
     # The cameras stand close to the LiDAR, so what hides a cluster from it by half hides it from them by half.
     radii = 0.5 * np.maximum(clusters.sizes_m[:, 0], clusters.sizes_m[:, 1])
     covered = hidden_share(clusters.offsets_m, params.radius_m, clusters.offsets_m, radii, nearer_by_m=0.5)
-    visible = 1 - covered.max(axis=1)
+    visible = 1 - covered.max(axis=0)
     rank = (0.2 + 0.8 * visible) / (1 + np.exp(-clusters.person_like - 1))
 
     delays_s = np.array([camera.detections.stamp_ns - frame.stamp_ns for camera in cameras]) * 1e-9

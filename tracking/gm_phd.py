@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.optimize import linear_sum_assignment
 
 from schemas.messages import BoolArray, FloatArray, IntArray
+from tracking.assignment import assign
 from tracking.measurements import Measurements
 from tracking.mixture_reduction import GaussianMixture, concatenate, label_mass, merge, prune
 from tracking.motion_model import process_noise, transition
@@ -56,12 +56,13 @@ class Pairs:
 
     def where(self, keep: BoolArray) -> "Pairs":
         """Returns the pairs marked True."""
+        kept = np.flatnonzero(keep)
         return Pairs(
-            self.component[keep],
-            self.measurement[keep],
-            self.innovation_m[keep],
-            self.S_inverse[keep],
-            self.likelihood[keep],
+            self.component.take(kept),
+            self.measurement.take(kept),
+            self.innovation_m.take(kept, axis=0),
+            self.S_inverse.take(kept, axis=0),
+            self.likelihood.take(kept),
         )
 
 
@@ -82,23 +83,23 @@ def gate(predicted: GaussianMixture, measurements: Measurements, limit: float) -
     z, R = measurements.positions_m, measurements.covariances_m2
     if len(z) == 0 or len(predicted.weights) == 0:
         return Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
-    reach = np.sqrt(limit * (predicted.covs[:, [0, 1], [0, 1]] + R[:, [0, 1], [0, 1]].max(axis=0)))  # (J, 2)
-    x, y = predicted.means[:, 0, None], predicted.means[:, 1, None]
-    near = (np.abs(z[:, 0] - x) < reach[:, :1]) & (np.abs(z[:, 1] - y) < reach[:, 1:])  # (J, M)
-    j, m = np.nonzero(near)
-    S = predicted.covs[j, :2, :2] + R[m]
-    determinant = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] * S[:, 1, 0]
-    innovation = z[m] - predicted.means[j, :2]
-    dx, dy = innovation[:, 0], innovation[:, 1]
-    distance = (S[:, 1, 1] * dx * dx - 2 * S[:, 0, 1] * dx * dy + S[:, 0, 0] * dy * dy) / determinant
-    keep = distance < limit
-    j, m, innovation, distance, determinant = j[keep], m[keep], innovation[keep], distance[keep], determinant[keep]
-    S = S[keep]
-    S_inverse = np.empty_like(S)
-    S_inverse[:, 0, 0], S_inverse[:, 1, 1] = S[:, 1, 1] / determinant, S[:, 0, 0] / determinant
-    S_inverse[:, 0, 1] = S_inverse[:, 1, 0] = -S[:, 0, 1] / determinant
+    x, y = predicted.means[:, 0], predicted.means[:, 1]
+    (pxx, pxy), (pyx, pyy) = predicted.covs[:, :2, :2].transpose(1, 2, 0)  # (J,) each
+    (rxx, rxy), (ryx, ryy) = R.transpose(1, 2, 0)  # (M,) each
+    reach_x, reach_y = np.sqrt(limit * (pxx + rxx.max())), np.sqrt(limit * (pyy + ryy.max()))
+    near = np.abs(z[:, 0] - x[:, None]) < reach_x[:, None]  # (J, M)
+    near &= np.abs(z[:, 1] - y[:, None]) < reach_y[:, None]
+    j, m = np.divmod(np.flatnonzero(near), len(z))
+    sxx, sxy, syx, syy = pxx[j] + rxx[m], pxy[j] + rxy[m], pyx[j] + ryx[m], pyy[j] + ryy[m]
+    determinant = sxx * syy - sxy * syx
+    dx, dy = z[:, 0][m] - x[j], z[:, 1][m] - y[j]
+    distance = (syy * dx * dx - 2 * sxy * dx * dy + sxx * dy * dy) / determinant
+    innovation, S_inverse = np.empty((len(j), 2)), np.empty((len(j), 2, 2))
+    innovation[:, 0], innovation[:, 1] = dx, dy
+    S_inverse[:, 0, 0], S_inverse[:, 1, 1] = syy / determinant, sxx / determinant
+    S_inverse[:, 0, 1] = S_inverse[:, 1, 0] = -sxy / determinant
     likelihood = np.exp(-0.5 * distance) / (2 * np.pi * np.sqrt(determinant))
-    return Pairs(j, m, innovation, S_inverse, likelihood)
+    return Pairs(j, m, innovation, S_inverse, likelihood).where(distance < limit)
 
 
 def weigh(
@@ -123,29 +124,17 @@ def weigh(
 def own(component_labels: IntArray, pairs: Pairs, pair_weights: FloatArray) -> BoolArray:
     """Marks the pairs (P,) that remain when each label may own one measurement and each measurement one label.
 
-    The assignment with the largest total mass (Hungarian). Where a label and a measurement know only each other
-    there is nothing to solve, so in a sparse scene the matrix stays small.
+    The assignment with the largest total mass (Hungarian).
     """
     label = component_labels[pairs.component]
     if len(label) == 0:
         return np.zeros(0, bool)
     M = int(pairs.measurement.max()) + 1
-    edges, edge = np.unique(label * M + pairs.measurement, return_inverse=True)  # (E,), (P,)
-    mass = np.bincount(edge, pair_weights, len(edges))
-    edge_label, edge_measurement = edges // M, edges % M
-    owned = np.zeros(len(edges), bool)
-    alone = (np.bincount(edge_label)[edge_label] == 1) & (np.bincount(edge_measurement)[edge_measurement] == 1)
-    owned[alone] = True
-    contested = np.flatnonzero(~alone)
-    if len(contested):
-        rows, row = np.unique(edge_label[contested], return_inverse=True)
-        columns, column = np.unique(edge_measurement[contested], return_inverse=True)
-        matrix = np.zeros((len(rows), len(columns)))
-        matrix[row, column] = mass[contested]
-        best = np.full(len(rows), -1)
-        assigned_rows, assigned_columns = linear_sum_assignment(matrix, maximize=True)
-        best[assigned_rows] = assigned_columns
-        owned[contested] = best[row] == column
+    edge = label * M + pairs.measurement  # (P,)  several components of a label give one edge
+    edges = np.flatnonzero(np.bincount(edge))
+    mass = np.bincount(edge, pair_weights)
+    owned = np.zeros(len(mass), bool)
+    owned[edges] = assign(edges // M, edges % M, mass[edges])
     return owned[edge]
 
 
@@ -170,7 +159,8 @@ def update(
     P = predicted.covs[j]
     K = P[:, :, :2] @ pairs.S_inverse  # (P, 4, 2)
     means = predicted.means[j] + (K @ pairs.innovation_m[:, :, None])[:, :, 0]
-    I_KH = np.broadcast_to(_I4, P.shape).copy()
+    I_KH = np.empty_like(P)
+    I_KH[:] = _I4
     I_KH[:, :, :2] -= K
     # Joseph's form stays symmetric and positive whatever the rounding.
     covs = I_KH @ P @ I_KH.swapaxes(1, 2) + K @ covariances_m2[pairs.measurement] @ K.swapaxes(1, 2)

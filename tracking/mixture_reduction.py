@@ -37,12 +37,18 @@ def concatenate(*mixtures: GaussianMixture) -> GaussianMixture:
 
 def select(mixture: GaussianMixture, rows: IntArray | BoolArray) -> GaussianMixture:
     """Returns the components at `rows`, an index or a mask."""
-    return GaussianMixture(mixture.weights[rows], mixture.means[rows], mixture.covs[rows], mixture.labels[rows])
+    index = np.flatnonzero(rows) if rows.dtype == bool else rows
+    return GaussianMixture(
+        mixture.weights.take(index),
+        mixture.means.take(index, axis=0),
+        mixture.covs.take(index, axis=0),
+        mixture.labels.take(index),
+    )
 
 
 def label_mass(mixture: GaussianMixture, L: int) -> FloatArray:
     """Returns the summed weight (L,) of each label's components."""
-    return np.bincount(mixture.labels, mixture.weights, L).astype(float)
+    return np.bincount(mixture.labels, mixture.weights, L).astype(float, copy=False)
 
 
 def prune(mixture: GaussianMixture, weight: float, share: float = 0.0) -> GaussianMixture:
@@ -80,35 +86,49 @@ def merge(mixture: GaussianMixture, distance: float, components_per_label: int) 
     """
     if len(mixture) == 0:
         return mixture
-    several = np.bincount(mixture.labels)[mixture.labels] > 1
-    alone = select(mixture, np.flatnonzero(~several))
-    rest = select(mixture, np.flatnonzero(several))
-    rest = select(rest, np.lexsort((-rest.weights, rest.labels)))
-    merged = [alone]
-    for turn in range(components_per_label):
-        if len(rest) == 0:
-            break
-        first = np.ones(len(rest), bool)
-        first[1:] = rest.labels[1:] != rest.labels[:-1]
-        group = np.cumsum(first) - 1  # (J,)  which pivot each component is held against
-        pivot = np.flatnonzero(first)
-        near = first | (turn == components_per_label - 1)
-        others = np.flatnonzero(~near)
-        if len(others):
-            delta = rest.means[others] - rest.means[pivot[group[others]]]
-            inverse = np.linalg.inv(rest.covs[pivot[group[others]]])
-            near[others] = (delta * (inverse @ delta[:, :, None])[:, :, 0]).sum(axis=1) < distance
-        merged.append(_moment_match(select(rest, near), group[near], len(pivot)))
-        rest = select(rest, ~near)
-    together = concatenate(*merged)
+    mixture = select(mixture, np.lexsort((-mixture.weights, mixture.labels)))
+    repeated = mixture.labels[1:] == mixture.labels[:-1]
+    if not repeated.any():
+        return mixture
+    several = np.zeros(len(mixture), bool)
+    several[1:] = repeated
+    several[:-1] |= repeated
+    rest = select(mixture, several)
+    together = concatenate(select(mixture, ~several), _moment_match(rest, _pivots(rest, distance, components_per_label)))
     return select(together, np.lexsort((-together.weights, together.labels)))
 
 
-def _moment_match(mixture: GaussianMixture, group: IntArray, G: int) -> GaussianMixture:
-    """Returns one component (G,) per group, with its total weight, mean and covariance."""
-    if len(mixture) == G:
-        return mixture
-    starts = np.searchsorted(group, np.arange(G))
+def _pivots(mixture: GaussianMixture, distance: float, components_per_label: int) -> IntArray:
+    """Returns the component (J,) that each one merges into; `mixture` is sorted by label, then by falling weight."""
+    pivots = np.empty(len(mixture), np.int64)
+    rest = np.arange(len(mixture))
+    for turn in range(components_per_label):
+        labels = mixture.labels[rest]
+        first = np.ones(len(rest), bool)
+        first[1:] = labels[1:] != labels[:-1]
+        pivot = rest[first][np.cumsum(first) - 1]  # the heaviest of each label, beside each of its components
+        if turn == components_per_label - 1:
+            pivots[rest] = pivot
+            break
+        near = first.copy()
+        others = np.flatnonzero(~first)
+        delta = mixture.means[rest[others]] - mixture.means[pivot[others]]
+        inverse = np.linalg.inv(mixture.covs[pivot[others]])
+        near[others] = (delta * (inverse @ delta[:, :, None])[:, :, 0]).sum(axis=1) < distance
+        pivots[rest[near]] = pivot[near]
+        rest = rest[~near]
+        if len(rest) == 0:
+            break
+    return pivots
+
+
+def _moment_match(mixture: GaussianMixture, pivots: IntArray) -> GaussianMixture:
+    """Returns one component per pivot, with the total weight, mean and covariance of those that merge into it."""
+    order = np.argsort(pivots, kind="stable")
+    mixture, pivots = select(mixture, order), pivots[order]
+    first = np.ones(len(pivots), bool)
+    first[1:] = pivots[1:] != pivots[:-1]
+    starts, group = np.flatnonzero(first), np.cumsum(first) - 1
     weights = np.add.reduceat(mixture.weights, starts)
     share = mixture.weights / np.maximum(weights[group], 1e-300)
     means = np.add.reduceat(share[:, None] * mixture.means, starts)

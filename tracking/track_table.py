@@ -27,6 +27,9 @@ class Labels:
         return len(self.born_ns)
 
 
+_COLUMNS = tuple(field.name for field in fields(Labels))
+
+
 def no_labels() -> Labels:
     """Returns an empty table."""
     i, f = np.zeros(0, np.int64), np.zeros(0)
@@ -45,12 +48,12 @@ def append(labels: Labels, more: Labels) -> Labels:
     """Returns the rows of both."""
     if len(more) == 0:
         return labels
-    return Labels(*(np.concatenate([getattr(labels, f.name), getattr(more, f.name)]) for f in fields(Labels)))
+    return Labels(*(np.concatenate([getattr(labels, column), getattr(more, column)]) for column in _COLUMNS))
 
 
 def take(labels: Labels, rows: IntArray) -> Labels:
     """Returns the given rows."""
-    return Labels(*(getattr(labels, f.name)[rows] for f in fields(Labels)))
+    return Labels(*(getattr(labels, column).take(rows) for column in _COLUMNS))
 
 
 @dataclass(frozen=True, eq=False)

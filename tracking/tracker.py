@@ -129,7 +129,7 @@ def advance(
 
 def _probabilities(detection_probability: DetectionProbability, positions_m: FloatArray) -> FloatArray:
     if callable(detection_probability):
-        return np.clip(detection_probability(positions_m), 0.0, 1.0)
+        return np.minimum(np.maximum(detection_probability(positions_m), 0.0), 1.0)
     return np.full(len(positions_m), float(detection_probability))
 
 
@@ -175,7 +175,7 @@ def _update_labels(
     memory = math.exp(-dt_s / params.class_memory_s)
     log_odds = labels.class_log_odds.copy()
     news = _log_odds(measurements.pedestrian_probability[correction.measurement[hit]])
-    log_odds[hit] = np.clip(log_odds[hit] * memory + news, -MAX_CLASS_LOG_ODDS, MAX_CLASS_LOG_ODDS)
+    log_odds[hit] = np.minimum(np.maximum(log_odds[hit] * memory + news, -MAX_CLASS_LOG_ODDS), MAX_CLASS_LOG_ODDS)
     return replace(
         labels,
         hits=hits,
@@ -312,7 +312,7 @@ class Tracker:
         means, covs = state.mixture.means[heaviest], state.mixture.covs[heaviest]
         first = np.searchsorted(history.stamps_ns, labels.born_ns[rows]).tolist()
         born_ns, born_index = labels.born_ns[rows].tolist(), labels.born_index[rows].tolist()
-        existence = np.clip(labels.existence[rows], 0.0, 1.0).tolist()
+        existence = np.minimum(np.maximum(labels.existence[rows], 0.0), 1.0).tolist()
         unseen_ns = (state.stamp_ns - labels.last_hit_ns[rows]).tolist()
         coasting_after_ns = round(params.coasting_after_s * 1e9)
         tracks = []

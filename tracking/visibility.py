@@ -32,7 +32,7 @@ def hidden_share(
     *,
     nearer_by_m: float,
 ) -> FloatArray:
-    """Returns how much of each target's angular width the nearer objects cover, (J, K) per object, 0 to 1.
+    """Returns how much of each target's angular width each nearer object covers, (K, J), 0 to 1.
 
     Seen from the origin of the positions, from above.
 
@@ -43,13 +43,13 @@ def hidden_share(
         occluder_radii_m: (K,) half widths across the line of sight.
         nearer_by_m: an object hides only what is at least this much farther away.
     """
-    target_range = np.maximum(np.hypot(targets_m[:, 0], targets_m[:, 1]), 1e-3)[:, None]
-    occluder_range = np.maximum(np.hypot(occluders_m[:, 0], occluders_m[:, 1]), 1e-3)
-    bearing = np.arctan2(targets_m[:, 1], targets_m[:, 0])[:, None]
-    apart = np.abs(bearing - np.arctan2(occluders_m[:, 1], occluders_m[:, 0]))  # (J, K)
+    target_range = np.maximum(np.hypot(targets_m[:, 0], targets_m[:, 1]), 1e-3)  # (J,)
+    occluder_range = np.maximum(np.hypot(occluders_m[:, 0], occluders_m[:, 1]), 1e-3)[:, None]  # (K, 1)
+    bearing = np.arctan2(targets_m[:, 1], targets_m[:, 0])
+    apart = np.abs(bearing - np.arctan2(occluders_m[:, 1], occluders_m[:, 0])[:, None])  # (K, J)
     apart = np.minimum(apart, 2 * np.pi - apart)
     half = np.arctan2(target_radius_m, target_range)
-    occluder_half = np.arctan2(occluder_radii_m, occluder_range)
+    occluder_half = np.arctan2(occluder_radii_m[:, None], occluder_range)
     overlap = np.minimum(apart + half, occluder_half) - np.maximum(apart - half, -occluder_half)
     covered: FloatArray = np.minimum(np.maximum(overlap / (2 * half), 0.0), 1.0) * (
         occluder_range < target_range - nearer_by_m
@@ -68,17 +68,17 @@ def detection_probability(frame: SensorFrame, params: VisibilityParams) -> Calla
     sizes = clusters.sizes_m[sound]
     occluders = apply(frame.map_from_lidar, clusters.centroids_m[sound])[:, :2] - origin
     radii = 0.5 * np.maximum(sizes[:, 0], sizes[:, 1])
-    hides = np.clip(sizes[:, 2] / params.hiding_height_m, 0.0, 1.0)
+    hides = np.minimum(np.maximum(sizes[:, 2] / params.hiding_height_m, 0.0), 1.0)
 
     def probability(positions_m: FloatArray) -> FloatArray:
         targets = positions_m - origin
         ranges = np.hypot(targets[:, 0], targets[:, 1])
-        falloff = np.clip((params.max_range_m - ranges) / (params.max_range_m - params.full_range_m), 0.0, 1.0)
-        clear = params.p_detect * falloff
+        falloff = (params.max_range_m - ranges) / (params.max_range_m - params.full_range_m)
+        clear = params.p_detect * np.minimum(np.maximum(falloff, 0.0), 1.0)
         if len(occluders) == 0 or len(targets) == 0:
             return clear
         covered = hidden_share(targets, params.person_radius_m, occluders, radii, nearer_by_m=params.nearer_by_m)
-        hidden = (covered * hides).max(axis=1)
+        hidden = (covered * hides[:, None]).max(axis=0)
         return np.where(clear > 0, clear * (1 - hidden) + np.minimum(params.p_detect_hidden, clear) * hidden, 0.0)
 
     return probability

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pcgan import checkpoint
+from pcgan import checkpoint, modal_paths
 from pcgan.predictor import Predictor
 from schemas import codec
 from schemas.messages import PredictionFrame, VehicleHistory
@@ -113,7 +113,6 @@ def test_answers_are_equal_bit_for_bit(predictor, make_frame, make_track, make_g
     predictor.step(make_frame(make_track(id=3, position=(100, 2))))  # another frame in between leaves no trace
     assert codec.encode(predictor.step(frame)) == first
     assert codec.encode(Predictor(make_generator(), "random", "").step(frame)) == first
-    assert torch.get_num_threads() == 1
 
 
 def test_slow_model_reads_a_longer_history(make_generator, make_frame, make_track):
@@ -140,3 +139,42 @@ def test_from_checkpoint_knows_its_file(tmp_path, make_generator, make_frame, ma
     frame = make_frame(make_track(noise_m=0.05))
     expected = Predictor(generator, "campus", "").step(frame)
     assert codec.encode(loaded.step(frame)) == codec.encode(expected)
+
+
+@pytest.mark.parametrize("recipe", ["best", "paper"])
+@pytest.mark.parametrize("vehicle_speed_mps", [4.0, None])
+def test_answer_is_the_torch_generators(make_generator, make_frame, make_track, recipe, vehicle_speed_mps):
+    tracks = [make_track(id=i, position=(i % 7, i // 7), velocity=(1 - 0.1 * i, 0.5), noise_m=0.03) for i in range(30)]
+    frame = make_frame(*tracks, vehicle_speed_mps=vehicle_speed_mps)
+    generator = make_generator(recipe=recipe)
+    predictions = Predictor(generator, "random", "").step(frame).predictions
+
+    states = torch.tensor(np.array([track.history.states[-8:] for track in tracks]), dtype=torch.float32)
+    velocity = torch.tensor(np.array([track.state[2:] for track in tracks]), dtype=torch.float32)
+    vehicle = None
+    if vehicle_speed_mps is not None:
+        vehicle = torch.tensor(frame.vehicle_history.states[-8:, [0, 1, 3, 4]], dtype=torch.float32)
+    everyone = torch.ones(30, 30, dtype=torch.bool)
+    with torch.inference_mode():
+        mixture = generator(states[..., :2], velocity, everyone, vehicle)
+        paths = modal_paths.modal_paths(mixture.weights, mixture.means, generator.config.eps_m)
+    for i, prediction in enumerate(predictions):
+        np.testing.assert_allclose(prediction.mixture.weights, mixture.weights[i], atol=1e-5)
+        np.testing.assert_allclose(prediction.mixture.means_m, mixture.means[i], atol=1e-5)
+        np.testing.assert_allclose(prediction.mixture.sigmas_m, mixture.log_sigmas[i].exp(), atol=1e-5)
+        np.testing.assert_allclose(prediction.mixture.rhos, mixture.rhos[i], atol=1e-5)
+        assert len(prediction.paths) == (paths.probabilities[i] > 0).sum()
+        for path, probability, points in zip(prediction.paths, paths.probabilities[i], paths.points[i], strict=False):
+            assert path.probability == pytest.approx(probability, abs=1e-5)
+            np.testing.assert_allclose(path.points_m, points, atol=1e-5)
+    assert max(len(prediction.paths) for prediction in predictions) > 1
+
+
+def test_training_on_changes_no_predictor(make_generator, make_frame, make_track):
+    generator, frame = make_generator(), make_frame(make_track(noise_m=0.02))
+    predictor = Predictor(generator, "random", "")
+    before = codec.encode(predictor.step(frame))
+    with torch.no_grad():
+        for weights in generator.parameters():
+            weights += 0.1
+    assert codec.encode(predictor.step(frame)) == before

@@ -18,9 +18,9 @@ class Rig:
         self.make, self.refusals, self.frames = make, Refusals(), []
         self.sync = TimeSync(cameras, SyncSettings(**settings), self.refusals)
         for name in cameras:
-            self.sync.preload(make.calibration(), name)
+            self.sync.take_static(f"/gmsl/{name}/camera_info", name, make.calibration(), self.refusals)
         for name in mounts:
-            self.sync.preload(make.transform("base_link", name, (1.2, 0, 1.4)), None)
+            self.sync.take_static("/tf_static", None, make.transform("base_link", name, (1.2, 0, 1.4)), self.refusals)
 
     def _push(self, topic, camera, message, log_ms, at_ms):
         log_ns = self.make.stamp(at_ms + 20 if log_ms is None else log_ms)
@@ -160,7 +160,7 @@ def test_a_camera_without_detections_within_50_ms_gives_no_evidence(rig, at_ms, 
 def test_a_camera_without_a_calibration_gives_no_evidence(rig, make):
     r = rig(())
     r.sync = TimeSync(("A0",), SyncSettings(), r.refusals)
-    r.sync.preload(make.transform("base_link", "lidar"), None)
+    r.sync.take_static("/tf_static", None, make.transform("base_link", "lidar"), r.refusals)
     r.poses(*range(900, 1100, 10))
     r.boxes(1000)
     r.scan(1000)
