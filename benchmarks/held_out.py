@@ -50,7 +50,7 @@ def row(clip: str, vehicle: int | None, model: Path | None, note: str) -> dict[s
     """Returns one drive's figures as a row of the record."""
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "drive.mcap"
-        simulate(log, clip=clip, vehicle=vehicle, pedestrians=0, duration_s=3600.0, seed=SEED)
+        simulate(log, clip=clip, vehicle=vehicle, pedestrians=0, duration_s=None, seed=SEED)
         figures: Mapping[str, Any] = record(Replay([log], predictor=PredictorChoice("inline", model))).as_json()
     truth = figures["ground_truth"]
     return {

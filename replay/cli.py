@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
+from pydantic import ValidationError
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
@@ -16,6 +17,7 @@ from replay.errors import ReplayError
 from replay.frame_result import FrameResult
 from replay.interrupts import Interrupted
 from replay.record import Summary, record, refuse_overwriting
+from replay.session import ReplaySettings
 
 app = typer.Typer(
     name="pcgan",
@@ -86,6 +88,10 @@ def replay(
     strict: Annotated[bool, typer.Option("--strict", help="Stop at the first message that is refused.")] = False,
     salvage: Salvage = False,
     topic: Remaps = None,
+    settings_file: Annotated[
+        Path | None,
+        typer.Option("--settings", metavar="FILE", help="Settings as JSON, such as an output's settings.json."),
+    ] = None,
 ) -> None:
     """Replay a drive: track its pedestrians, predict them, write the predictions.
 
@@ -103,7 +109,7 @@ def replay(
     """
     from replay.picture import BusiestMoment, draw_top_down
     from replay.rerun_view import NullView, RerunView
-    from replay.session import PredictorChoice, Replay, ReplaySettings
+    from replay.session import PredictorChoice, Replay
     from replay.summary_table import print_summary
 
     if connect and predictor is not PredictorMode.external:
@@ -116,7 +122,8 @@ def replay(
         _fail("--rrd and --view exclude each other: write the recording and open it with rerun, or watch now")
     output = output or logs[0].with_name(f"{logs[0].stem}.pcgan.mcap")
     refuse_overwriting(logs, *(path for path in (rrd, picture, summary) if path is not None))
-    settings = ReplaySettings(start_s=start, duration_s=duration, topics=_remaps(topic))
+    given = {"start_s": start or None, "duration_s": duration, "topics": _remaps(topic) or None}
+    settings = _settings(settings_file).model_copy(update={k: v for k, v in given.items() if v is not None})
     choice = PredictorChoice(predictor.value, model, connect, zenoh_config, namespace)
     images = rrd is not None or view
     run = Replay(logs, settings, choice, window=window, rate=rate, strict=strict, salvage=salvage, images=images)
@@ -157,7 +164,9 @@ def simulate(
         int | None, typer.Option(metavar="ID", help="The clip's vehicle that records. [default: the one that drives]")
     ] = None,
     pedestrians: Annotated[int, typer.Option(min=0, metavar="N", help="People around the vehicle, of a crowd.")] = 30,
-    duration: Annotated[float, typer.Option(min=0.5, metavar="S", help="Seconds; a clip may end sooner.")] = 60.0,
+    duration: Annotated[
+        float | None, typer.Option(min=0.5, metavar="S", help="[default: 60 of a crowd, all of a clip]")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, metavar="N", help="Of the crowd and of all sensor noise.")] = 0,
 ) -> None:
     """Simulate a USyd-style drive: six fisheye cameras, a VLP-16, odometry, and the truth.
@@ -168,7 +177,7 @@ def simulate(
 
     pcgan simulate drive.mcap --clip dut/intersection_08 --vehicle 2
     """
-    from pcgan.clips import DataNotFound
+    from pcgan.clips import ClipError, DataNotFound
     from replay.simulator import SimulationError
     from replay.simulator import simulate as simulate_drive
 
@@ -180,12 +189,14 @@ def simulate(
                 clip=clip,
                 vehicle=vehicle,
                 pedestrians=pedestrians,
-                duration_s=duration if clip is None or duration != 60.0 else 3600.0,
+                duration_s=duration,
                 seed=seed,
                 progress=lambda fraction: progress.update(task, completed=fraction),
             )
-        except (SimulationError, DataNotFound) as error:
+        except (SimulationError, ClipError, DataNotFound) as error:
             _fail(str(error))
+        except OSError as error:
+            _fail(f"{output} cannot be written: {error.strerror or error}")
     typer.echo(f"{output}: {drive.duration_s:.1f} s of {drive.motion}, {drive.pedestrians} people, {drive.scans} scans")
 
 
@@ -303,6 +314,8 @@ def train(
         typer.echo(train_model(config, console=errors))
     except (DataNotFound, WindowsError, CheckpointError, ValueError) as error:
         _fail(str(error))
+    except OSError as error:
+        _fail(f"{output} cannot be written: {error.strerror or error}")
 
 
 @app.command()
@@ -318,17 +331,21 @@ def windows(
 
     pcgan windows -o windows.npz --seeds 3
     """
-    from pcgan.clips import DataNotFound
+    from pcgan.clips import ClipError, DataNotFound
     from replay.training_windows import make_windows
 
+    if not output.parent.is_dir():
+        _fail(f"{output} cannot be written: there is no folder {output.parent}")
     with _progress() as progress:
         task = progress.add_task("tracking drives", total=None)
         try:
             count = make_windows(
                 output, seeds, progress=lambda done, total: progress.update(task, completed=done, total=total)
             )
-        except DataNotFound as error:
+        except (ClipError, DataNotFound) as error:
             _fail(str(error))
+        except OSError as error:
+            _fail(f"{output} cannot be written: {error.strerror or error}")
     typer.echo(f"{output}: {count} windows")
 
 
@@ -355,6 +372,20 @@ def _remaps(options: list[str] | None) -> dict[str, str]:
             _fail(f"--topic wants NAME:=NAME, for example /vn100/odometry:=/odom; got {option!r}")
         remaps[default] = name
     return remaps
+
+
+def _settings(path: Path | None) -> ReplaySettings:
+    """Reads settings from a JSON file; what it leaves out keeps its default."""
+    if path is None:
+        return ReplaySettings()
+    try:
+        return ReplaySettings.model_validate_json(path.read_bytes())
+    except OSError as error:
+        _fail(f"{path} cannot be read: {error.strerror or error}")
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "the file"
+        _fail(f"{path} does not hold replay settings: {where}: {first['msg']}")
 
 
 def _progress() -> Progress:

@@ -72,7 +72,8 @@ class LogReader:
         self._files = [_open(path, self.losses if salvage else None) for path in self.paths]
         starts = [file.start_ns for file in self._files if file.channels]
         if not starts:
-            raise LogError(f"{_names(self.paths)} holds no messages")
+            losses = f" that can be read: {'; '.join(self.losses.notes)}" if self.losses.notes else ""
+            raise LogError(f"{_names(self.paths)} holds no messages{losses}")
         self.start_ns = min(starts)
         self.end_ns = max(file.end_ns for file in self._files if file.channels)
 

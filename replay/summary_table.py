@@ -35,7 +35,10 @@ def print_summary(summary: Summary, written: Sequence[Path], console: Console) -
             f"and {truth['people_predicted']} predicted by the network"
         )
     stages = ", ".join(f"{stage} {ms['p50']:.1f}/{ms['p99']:.1f}" for stage, ms in summary.latency_ms.items())
-    console.print(f"[dim]latency p50/p99 in ms: {stages}[/]", soft_wrap=True)
+    console.print(
+        f"[dim]latency p50/p99 in ms: {stages} (predict: from asking to answer, with up to a window in line)[/]",
+        soft_wrap=True,
+    )
     if summary.restarts:
         console.print(f"the predictor was replaced {summary.restarts} times; nothing was lost")
     for line in summary.first_refusals[:5]:

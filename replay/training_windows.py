@@ -22,7 +22,6 @@ from replay.simulator import simulate
 from schemas.messages import IntArray, TrackFrame
 
 SHORTEST_S = 3.0  # a vehicle that is there for less makes no drive
-MAX_DURATION_S = 120.0
 
 
 def make_windows(
@@ -58,7 +57,7 @@ def make_windows(
             if progress is not None:
                 progress(done, len(drives))
             log = Path(folder) / "drive.mcap"
-            simulate(log, clip=name, vehicle=vehicle, pedestrians=0, duration_s=MAX_DURATION_S, seed=seed)
+            simulate(log, clip=name, vehicle=vehicle, pedestrians=0, duration_s=None, seed=seed)
             found = _drive_scenes(log, config)
             scenes += found
             clips += [name] * len(found)

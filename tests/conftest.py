@@ -103,6 +103,7 @@ def edit_log(tmp_path):
         change: Callable[[list[tuple[str, int, bytes]]], Iterable[tuple[str, int, bytes]]],
         name: str = "edited.mcap",
         topics: Mapping[str, str] = MappingProxyType({}),  # old name -> new name
+        **options,  # of mcap.writer.Writer
     ) -> Path:
         found, schema_of, declared = [], {}, {}
         with source.open("rb") as stream:
@@ -112,7 +113,7 @@ def edit_log(tmp_path):
         path = tmp_path / name
         numbers: dict[str, int] = defaultdict(int)
         with path.open("wb") as stream:
-            writer = Writer(stream)
+            writer = Writer(stream, **options)
             writer.start(profile="", library="pcgan tests")
             for topic, log_time_ns, data in change(found):
                 if topic not in declared:

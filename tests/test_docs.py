@@ -1,6 +1,5 @@
 """The documents against the code: commands parse, snippets run, options, fields and settings match, links resolve."""
 
-import json
 import re
 import shlex
 import shutil
@@ -15,7 +14,7 @@ import typer
 from google.protobuf.descriptor import FieldDescriptor
 
 from pcgan.dataset import HELD_OUT_CLIPS, VALIDATION_CLIPS
-from replay import PredictorChoice, Replay, ReplaySettings
+from replay import PredictorChoice, Replay
 from replay.cli import app
 from replay.decoders import DECODERS
 from replay.record import Summary, record
@@ -191,10 +190,6 @@ def test_tracking_page_has_every_setting_with_its_default():
     assert all(row[2] for row in table)
 
 
-def test_library_page_names_settings_that_exist():
-    assert set(ReplaySettings.model_fields) == {"start_s", "duration_s", "topics", "sync", "tracking"}
-
-
 def test_simulator_page_quotes_the_frozen_model():
     text = (DOCS / "simulator.md").read_text()
     assert f"version {SensorModelV1().version}" in text
@@ -235,7 +230,7 @@ def folder(tmp_path, monkeypatch, short_drive):
 @pytest.mark.parametrize("code", SNIPPETS)
 def test_snippets_run(code, folder, capsys):  # noqa: ARG001  runs in the folder
     exec(compile(code, "snippet", "exec"), {"__name__": "snippet"})
-    assert capsys.readouterr().out or "assert" in code or "frame" in code
+    assert bool(capsys.readouterr().out) == ("print(" in code)
 
 
 @pytest.mark.slow
@@ -287,9 +282,3 @@ def test_no_machine_paths_and_no_registries(page):
     text = page.read_text()
     assert not re.search(r"(?<![\w.$}])/(home|root|tmp|work|Users|mnt)/", text)
     assert not re.search(r"pypi|download\.pytorch|anaconda|conda-forge", text, re.IGNORECASE)
-
-
-def test_json_examples_are_json():
-    for page in PAGES:
-        for block in blocks(page, "json"):
-            json.loads(block)

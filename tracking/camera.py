@@ -4,12 +4,12 @@ Optical frame: x right, y down, z forward. `r` is the distance from the optical 
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 
 import numpy as np
 
-from schemas.messages import BoolArray, CameraCalibration, FloatArray
+from schemas.messages import BoolArray, CameraCalibration, FloatArray, IntArray
 
 MIN_DEPTH_M = 0.1
 COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
@@ -68,6 +68,13 @@ class CameraModel:
         except CalibrationError as error:
             raise CalibrationError(f"{calibration.frame_id}: {error}") from error
 
+    @cached_property
+    def view_rad(self) -> float:
+        """Half angle of the cone round the optical axis that holds everything in the image."""
+        corners = np.array([(x, y) for x in (0, self.width_px) for y in (0, self.height_px)], float)
+        angles = np.arccos(self.ray(corners)[:, 2])
+        return float(np.where(np.isnan(angles), self.max_theta_rad, angles).max())
+
     def project(self, points_camera: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Projects points (..., 3) in m of the optical frame to raw pixels (..., 2), which may lie outside the image.
 
@@ -75,7 +82,7 @@ class CameraModel:
         Pixels of the others are NaN, as are those of points that are not finite.
         """
         points = np.asarray(points_camera, float)
-        pixels, valid = project_all((self,), points.reshape(1, -1, 3))
+        pixels, valid = project_all(make_rig((self,)), np.zeros(1, np.int64), points.reshape(1, -1, 3))
         return pixels.reshape(*points.shape[:-1], 2), valid.reshape(points.shape[:-1])
 
     def ray(self, pixels: FloatArray) -> FloatArray:
@@ -143,22 +150,42 @@ class CameraModel:
         return distorted_x - x, distorted_y - y
 
 
-def project_all(cameras: Sequence[CameraModel], points_camera: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Projects points (C, N, 3), row c in the optical frame of camera c; see `CameraModel.project`.
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """The numbers of several cameras, one column each, so that all of them project in one batch."""
 
-    Returns pixels (C, N, 2) and the mask (C, N). Cameras of one kind, as a vehicle's mostly are, go in one batch.
+    models: tuple[str, ...]  # the different ones
+    model: IntArray  # (C,)  which of them
+    intrinsics: FloatArray  # (5, C)  fx, fy, cx, cy, max_radius
+    distortion: FloatArray  # (8, C)  zeros past a model's own
+    size_px: FloatArray  # (C, 2)
+    view_rad: FloatArray  # (C,)
+
+
+@lru_cache(maxsize=16)
+def make_rig(cameras: tuple[CameraModel, ...]) -> Rig:
+    """Returns the cameras' numbers; a vehicle's cameras seldom change, so these are kept."""
+    models = tuple(sorted({camera.model for camera in cameras}))
+    distortion = np.zeros((8, len(cameras)))
+    for column, camera in enumerate(cameras):
+        distortion[: len(camera.distortion), column] = camera.distortion
+    return Rig(
+        models,
+        np.array([models.index(c.model) for c in cameras], np.int64),
+        np.array([(c.fx, c.fy, c.cx, c.cy, c.max_radius) for c in cameras]).reshape(-1, 5).T.copy(),
+        distortion,
+        np.array([(c.width_px, c.height_px) for c in cameras], float).reshape(-1, 2),
+        np.array([c.view_rad for c in cameras]),
+    )
+
+
+def project_all(rig: Rig, camera: IntArray, points_camera: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Projects points (R, N, 3), row r in the optical frame of the rig's camera[r]; see `CameraModel.project`.
+
+    Returns pixels (R, N, 2) and the mask (R, N).
     """
     points = np.asarray(points_camera, float)
-    kinds = [(camera.model, len(camera.distortion)) for camera in cameras]
-    if len(set(kinds)) > 1:
-        pixels, valid = np.empty((*points.shape[:2], 2)), np.empty(points.shape[:2], bool)
-        for kind in sorted(set(kinds)):
-            rows = [row for row, other in enumerate(kinds) if other == kind]
-            pixels[rows], valid[rows] = project_all([cameras[row] for row in rows], points[rows])
-        return pixels, valid
-
-    settings = np.array([(c.fx, c.fy, c.cx, c.cy, c.max_radius) for c in cameras]).reshape(-1, 5)
-    fx, fy, cx, cy, max_radius = settings.T[:, :, None]  # (C, 1) each
+    fx, fy, cx, cy, max_radius = rig.intrinsics[:, camera, None]  # (R, 1) each
     z = points[..., 2]
     valid = z >= MIN_DEPTH_M
     depth = np.where(valid, z, 1.0)
@@ -171,9 +198,13 @@ def project_all(cameras: Sequence[CameraModel], points_camera: FloatArray) -> tu
     everywhere = bool(valid.all())
     if not everywhere:
         x, y, r2 = np.where(valid, x, 0.0), np.where(valid, y, 0.0), np.where(valid, r2, 0.0)
-    if cameras:
-        D = np.array([camera.distortion for camera in cameras]).T[:, :, None]  # (D, C, 1)
-        x, y = _distort(cameras[0].model, D, x, y, r2)
+    D = rig.distortion[:, camera, None]  # (8, R, 1)
+    if len(rig.models) == 1:
+        x, y = _distort(rig.models[0], D, x, y, r2)
+    else:
+        for number, model in enumerate(rig.models):
+            rows = np.flatnonzero(rig.model[camera] == number)
+            x[rows], y[rows] = _distort(model, D[:, rows], x[rows], y[rows], r2[rows])
     pixels = np.empty((*points.shape[:2], 2))
     pixels[..., 0] = fx * x + cx
     pixels[..., 1] = fy * y + cy

@@ -186,15 +186,13 @@ def _ask_cameras(
 
     delays_s = np.array([camera.detections.stamp_ns - frame.stamp_ns for camera in cameras]) * 1e-9
     moved = positions + velocities * delays_s[:, None, None]  # (C, M, 2)
-    outlines, in_image = _outlines(cameras, moved, _ground(frame, clusters, params), params)
+    people = outlines(
+        cameras, moved, _ground(frame, clusters, params), radius_m=params.radius_m, height_m=params.height_m
+    )
     boxes = _pedestrian_boxes(cameras, params)
-    # Boxes come in order of camera, so that each camera's rows are one slice.
-    likeness = _likeness(outlines[boxes.camera], in_image[boxes.camera] > 0, boxes.corners_px, params) * rank
-
-    starts = np.searchsorted(boxes.camera, np.arange(len(cameras) + 1)).tolist()
-    assigned = [_assign(likeness[start:end]) for start, end in pairwise(starts)]
-    box = np.concatenate([rows + start for (rows, _), start in zip(assigned, starts, strict=False)])  # (P,)
-    cluster = np.concatenate([columns for _, columns in assigned])  # (P,)
+    box, cluster, likeness = _matches(people, boxes, M, params)
+    assigned = assign(box, boxes.camera[box] * M + cluster, likeness * rank[cluster])
+    box, cluster = box[assigned], cluster[assigned]
     scores, camera = boxes.scores[box], boxes.camera[box]
     for_it = np.minimum(np.maximum(_log_odds(scores), params.min_box_log_odds), params.max_box_log_odds)
     log_odds = np.bincount(cluster, for_it, M)
@@ -205,11 +203,11 @@ def _ask_cameras(
     for m, c, row, score in found:
         evidence[m] = (*evidence[m], CameraEvidence(names[c], row, score))
     # No box where a person should have one speaks against a person, as far as there was a view of it.
-    tall = outlines[..., 3] - outlines[..., 1] >= params.min_height_px
-    proves = ~matched & tall & (in_image >= params.min_in_image)
+    tall = people.corners_px[:, 3] - people.corners_px[:, 1] >= params.min_height_px
+    proves = tall & (people.share_inside >= params.min_in_image) & ~matched[people.camera, people.person]
     expected = params.p_box * visible
     no_box = np.log((1 - expected) / (1 - np.minimum(params.p_box_other, expected)))
-    return log_odds + no_box * proves.sum(axis=0), evidence
+    return log_odds + no_box * np.bincount(people.person[proves], minlength=M), evidence
 
 
 def _log_odds(scores: FloatArray) -> FloatArray:
@@ -229,40 +227,6 @@ def _ground(frame: SensorFrame, clusters: _Clusters, params: FusionParams) -> Fl
     plane = origin[2] - tilt
     ground: FloatArray = np.clip(plane, z - 0.9 * params.height_m, z - 0.1 * params.height_m)
     return ground
-
-
-def _outlines(
-    cameras: Sequence[CameraFrame], positions: FloatArray, ground: FloatArray, params: FusionParams
-) -> tuple[FloatArray, FloatArray]:
-    """Returns each person's box (C, M, 4) in each camera, cut at the image's border, and the share inside (C, M).
-
-    `positions` (C, M, 2) are those at each camera's stamp. A person half behind a camera has a box of zeros.
-    """
-    camera_from_map = np.stack([camera.camera_from_map for camera in cameras])  # (C, 4, 4)
-    eyes = inverse(camera_from_map)[:, None, :2, 3]  # (C, 1, 2)
-    toward = positions - eyes
-    scale = params.radius_m / np.maximum(np.hypot(toward[..., 0], toward[..., 1]), 1e-3)
-    C, M = positions.shape[:2]
-    side = np.empty((C, M, 2))
-    side[..., 0], side[..., 1] = -toward[..., 1] * scale, toward[..., 0] * scale
-    corners = np.empty((3, 2, C, M, 3))  # three heights, two sides: a straight edge is curved in a fisheye image
-    corners[:, 0, ..., :2], corners[:, 1, ..., :2] = positions - side, positions + side
-    corners[..., 2] = (ground + params.height_m * np.array([0.0, 0.5, 1.0])[:, None])[:, None, None, :]
-    points = corners.transpose(2, 0, 1, 3, 4).reshape(C, 6 * M, 3)
-    points = points @ camera_from_map[:, :3, :3].swapaxes(1, 2) + camera_from_map[:, None, :3, 3]
-    pixels, valid = project_all([camera.model for camera in cameras], points)
-    pixels, valid = pixels.reshape(C, 6, M, 2), valid.reshape(C, 6, M)
-    low = np.fmin.reduce(pixels, axis=1)  # (C, M, 2); fmin and fmax pass over the NaN of corners that are not seen
-    high = np.fmax.reduce(pixels, axis=1)
-    out_of_view = np.count_nonzero(valid, axis=1) < 4
-    low[out_of_view] = high[out_of_view] = 0.0
-    area = (high[..., 0] - low[..., 0]) * (high[..., 1] - low[..., 1])
-    limits = np.array([(camera.model.width_px, camera.model.height_px) for camera in cameras], float)[:, None]
-    outlines = np.empty((C, M, 4))
-    outlines[..., :2] = low = np.minimum(np.maximum(low, 0.0), limits)
-    outlines[..., 2:] = high = np.minimum(np.maximum(high, 0.0), limits)
-    inside = (high[..., 0] - low[..., 0]) * (high[..., 1] - low[..., 1])
-    return outlines, inside / np.maximum(area, 1e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,31 +255,8 @@ def _pedestrian_boxes(cameras: Sequence[CameraFrame], params: FusionParams) -> _
     return _Boxes(camera[kept], rows[kept], corners[kept], scores[kept])
 
 
-def _likeness(outlines: FloatArray, in_view: BoolArray, boxes: FloatArray, params: FusionParams) -> FloatArray:
-    """Returns how well each box fits each person of its own camera, 0 past the gates.
-
-    Args:
-        outlines: (B, M, 4) of the people, in the camera of each box.
-        in_view: (B, M)
-        boxes: (B, 4)
-        params: gates.
-    """
-    x0, y0, x1, y1 = np.ascontiguousarray(outlines.transpose(2, 0, 1))  # (B, M) each
-    u0, v0, u1, v1 = boxes.T[:, :, None]  # (B, 1) each
-    width, height = x1 - x0, np.maximum(y1 - y0, 1e-9)
-    box_width, box_height = u1 - u0, v1 - v0
-    shared_x = np.minimum(x1, u1) - np.maximum(x0, u0)
-    shared_y = np.minimum(y1, v1) - np.maximum(y0, v0)
-    overlap = np.maximum(shared_x, 0.0) / np.maximum(width + box_width - shared_x, 1e-9)
-    inside = np.abs(x0 + x1 - u0 - u1) <= params.grown_box * box_width
-    inside &= np.abs(y0 + y1 - v0 - v1) <= params.grown_box * box_height
-    ratio = np.log(box_height / height) / params.max_height_log_ratio
-    gate = ((overlap >= params.min_overlap) | inside) & (shared_y > 0) & in_view & (np.abs(ratio) < 1)
-    return np.where(gate, (0.1 + overlap) * np.exp(-2 * ratio * ratio), 0.0)
-
-
-def _assign(likeness: FloatArray) -> tuple[IntArray, IntArray]:
-    """Returns boxes and their clusters, one to one, with the largest total likeness (B, M)."""
-    box, cluster = linear_sum_assignment(likeness, maximize=True)
-    real = likeness[box, cluster] > 0
-    return box[real], cluster[real]
+def _matches(
+    people: Outlines, boxes: _Boxes, M: int, params: FusionParams
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Returns boxes (P,), clusters (P,) and how well they fit, for each pair that passes the gates."""
+    table = np.full((4, len(people.names), M), np.nan)

@@ -9,6 +9,8 @@ from replay.simulator.drive import DriveSummary, Progress
 from replay.simulator.motion import SimulationError
 from replay.simulator.social_force import crowd_motion
 
+CROWD_DURATION_S = 60.0
+
 __all__ = ["DriveSummary", "SimulationError", "simulate"]
 
 
@@ -18,7 +20,7 @@ def simulate(
     clip: str | None,
     vehicle: int | None,
     pedestrians: int,
-    duration_s: float,
+    duration_s: float | None,
     seed: int,
     progress: Progress | None = None,
 ) -> DriveSummary:
@@ -29,7 +31,7 @@ def simulate(
         clip: an annotated clip to drive through ("dut/roundabout_04"), or None for a simulated crowd.
         vehicle: which of the clip's vehicles records; None for the one that moves and is present longest.
         pedestrians: how many people there are around the vehicle; a clip has its own.
-        duration_s: how long; a clip ends when its vehicle leaves, if that is sooner.
+        duration_s: how long; None: 60 s of a crowd, or all of a clip. A clip ends when its vehicle leaves.
         seed: of the crowd and of the sensors, 0 or more.
         progress: called now and then with the fraction done.
 
@@ -38,11 +40,14 @@ def simulate(
     """
     if seed < 0:
         raise SimulationError(f"a seed must be 0 or more, got {seed}")
-    if not (math.isfinite(duration_s) and duration_s > 0):
+    if duration_s is None and clip is None:
+        duration_s = CROWD_DURATION_S
+    if duration_s is not None and not (math.isfinite(duration_s) and duration_s > 0):
         raise SimulationError(f"a drive needs a positive duration, got {duration_s} s")
     if clip is None and vehicle is not None:
         raise SimulationError(f"vehicle {vehicle} is one of a clip's; name the clip, too")
     if clip is None:
+        assert duration_s is not None
         motion = crowd_motion(pedestrians, duration_s, seed)
         settings: dict[str, object] = {"pedestrians": pedestrians, "duration_s": duration_s}
     else:

@@ -165,7 +165,7 @@ def test_answer_is_the_torch_generators(make_generator, make_frame, make_track, 
         np.testing.assert_allclose(prediction.mixture.rhos, mixture.rhos[i], atol=1e-5)
         assert len(prediction.paths) == (paths.probabilities[i] > 0).sum()
         for path, probability, points in zip(prediction.paths, paths.probabilities[i], paths.points[i], strict=False):
-            assert path.probability == pytest.approx(probability, abs=1e-5)
+            assert path.probability == pytest.approx(probability.item(), abs=1e-5)
             np.testing.assert_allclose(path.points_m, points, atol=1e-5)
     assert max(len(prediction.paths) for prediction in predictions) > 1
 
@@ -176,5 +176,5 @@ def test_training_on_changes_no_predictor(make_generator, make_frame, make_track
     before = codec.encode(predictor.step(frame))
     with torch.no_grad():
         for weights in generator.parameters():
-            weights += 0.1
+            weights.add_(0.1)
     assert codec.encode(predictor.step(frame)) == before

@@ -117,9 +117,9 @@ def test_the_table_has_a_line_per_topic(short_drive):
     assert "cannot be replayed" not in text
 
 
-def test_damage_is_shown_when_salvaged(short_drive, tmp_path):
-    damaged = tmp_path / "damaged.mcap"
-    data = short_drive.read_bytes()
+def test_damage_is_shown_when_salvaged(short_drive, edit_log):
+    damaged = edit_log(short_drive, lambda log: log, "damaged.mcap", chunk_size=20_000)
+    data = damaged.read_bytes()
     damaged.write_bytes(data[: len(data) // 2])
     with pytest.raises(LogError, match=r"damaged\.mcap is not a readable MCAP file"):
         describe_log([damaged])
