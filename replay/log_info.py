@@ -122,9 +122,8 @@ def _stamp(message: RawMessage) -> int | None:
         decoded = DECODERS[message.schema_name][1](message.data)
     except CodecError:
         return None
-    first = decoded[0] if isinstance(decoded, tuple) else decoded
-    stamp_ns: int = first.stamp_ns
-    return stamp_ns
+    first = next(iter(decoded), None) if isinstance(decoded, tuple) else decoded
+    return None if first is None else int(first.stamp_ns)
 
 
 def _percentiles_ms(values_ns: np.ndarray) -> dict[str, float] | None:

@@ -189,7 +189,7 @@ class ReplayScore:
                 )
         oldest_ns = self._asked[0].stamp_ns if self._asked else now_ns
         for seen in (self._tracked, self._true):
-            while seen and oldest_ns is not None and seen[0].stamp_ns < oldest_ns:
+            while seen and oldest_ns is not None and seen[0].stamp_ns < oldest_ns - MAX_GAP_NS:
                 seen.popleft()
 
 

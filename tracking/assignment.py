@@ -9,8 +9,8 @@ from schemas.messages import BoolArray, FloatArray, IntArray
 def assign(rows: IntArray, columns: IntArray, gains: FloatArray) -> BoolArray:
     """Marks the pairs (P,) to keep so that no row and no column occurs twice and the total gain is the largest.
 
-    Where a row and a column know only each other there is nothing to solve, so the matrix for the Hungarian method holds
-    the contested pairs alone.
+    Where a row and a column know only each other there is nothing to solve: the Hungarian method gets the contested
+    pairs alone.
 
     Args:
         rows: (P,) numbers from 0; no pair of row and column occurs twice.

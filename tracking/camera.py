@@ -72,7 +72,8 @@ class CameraModel:
     def view_rad(self) -> float:
         """Half angle of the cone round the optical axis that holds everything in the image."""
         corners = np.array([(x, y) for x in (0, self.width_px) for y in (0, self.height_px)], float)
-        angles = np.arccos(self.ray(corners)[:, 2])
+        x, y, z = self.ray(corners).T
+        angles = np.arctan2(np.hypot(x, y), z)
         return float(np.where(np.isnan(angles), self.max_theta_rad, angles).max())
 
     def project(self, points_camera: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -159,7 +160,6 @@ class Rig:
     intrinsics: FloatArray  # (5, C)  fx, fy, cx, cy, max_radius
     distortion: FloatArray  # (8, C)  zeros past a model's own
     size_px: FloatArray  # (C, 2)
-    view_rad: FloatArray  # (C,)
 
 
 @lru_cache(maxsize=16)
@@ -175,7 +175,6 @@ def make_rig(cameras: tuple[CameraModel, ...]) -> Rig:
         np.array([(c.fx, c.fy, c.cx, c.cy, c.max_radius) for c in cameras]).reshape(-1, 5).T.copy(),
         distortion,
         np.array([(c.width_px, c.height_px) for c in cameras], float).reshape(-1, 2),
-        np.array([c.view_rad for c in cameras]),
     )
 
 

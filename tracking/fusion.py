@@ -5,16 +5,15 @@ One measurement per cluster: a person whom two cameras see is still one measurem
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.optimize import linear_sum_assignment
 
 from schemas.messages import BoolArray, FloatArray, IntArray
-from tracking.camera import project_all
-from tracking.geometry import apply, inverse
+from tracking.assignment import assign
+from tracking.geometry import apply
 from tracking.measurements import CameraEvidence, Measurements, PredictedTracks, empty_measurements, make_measurements
+from tracking.outlines import Outlines, outlines
 from tracking.sensor_frame import CameraFrame, SensorFrame
 from tracking.visibility import hidden_share
 
@@ -94,7 +93,7 @@ def fuse(frame: SensorFrame, predicted: PredictedTracks, params: FusionParams) -
 
     positions, covs = _positions(frame, clusters, params)
     log_odds, evidence = _ask_cameras(frame, clusters, positions, _velocities(positions, predicted, params), params)
-    total = np.clip(log_odds, -params.max_log_odds, params.max_log_odds) + clusters.person_like
+    total = np.minimum(np.maximum(log_odds, -params.max_log_odds), params.max_log_odds) + clusters.person_like
     measurements = make_measurements(positions, covs, 1 / (1 + np.exp(-total)), clusters.index, evidence)
     return _refuse(measurements, refused)
 
@@ -130,8 +129,8 @@ def _place(frame: SensorFrame, rows: IntArray, params: FusionParams) -> _Cluster
 
 def _size_log_odds(width: FloatArray, height: FloatArray, points: IntArray, params: FusionParams) -> FloatArray:
     """A person is up to a metre wide and two tall; walls, cars and trees are not, and poles are thinner."""
-    too_wide = np.clip((width - params.max_width_m) / 0.5, 0.0, 1.0)
-    too_tall = np.clip((height - params.max_height_m) / 0.5, 0.0, 1.0)
+    too_wide = np.minimum(np.maximum((width - params.max_width_m) / 0.5, 0.0), 1.0)
+    too_tall = np.minimum(np.maximum((height - params.max_height_m) / 0.5, 0.0), 1.0)
     thin = (width < params.pole_width_m) & (points >= 10)
     log_odds: FloatArray = params.base_log_odds - 4.0 * too_wide - 3.0 * too_tall - 0.8 * thin
     return log_odds
@@ -190,7 +189,7 @@ def _ask_cameras(
         cameras, moved, _ground(frame, clusters, params), radius_m=params.radius_m, height_m=params.height_m
     )
     boxes = _pedestrian_boxes(cameras, params)
-    box, cluster, likeness = _matches(people, boxes, M, params)
+    box, cluster, likeness = _matches(people, boxes, len(cameras), M, params)
     assigned = assign(box, boxes.camera[box] * M + cluster, likeness * rank[cluster])
     box, cluster = box[assigned], cluster[assigned]
     scores, camera = boxes.scores[box], boxes.camera[box]
@@ -225,7 +224,7 @@ def _ground(frame: SensorFrame, clusters: _Clusters, params: FusionParams) -> Fl
         return z - params.height_m / 2
     tilt = ((clusters.centroids_m[:, :2] - origin[:2]) @ up[:2]) / up[2]
     plane = origin[2] - tilt
-    ground: FloatArray = np.clip(plane, z - 0.9 * params.height_m, z - 0.1 * params.height_m)
+    ground: FloatArray = np.minimum(np.maximum(plane, z - 0.9 * params.height_m), z - 0.1 * params.height_m)
     return ground
 
 
@@ -246,8 +245,8 @@ def _pedestrian_boxes(cameras: Sequence[CameraFrame], params: FusionParams) -> _
     counts = [len(message.labels) for message in messages]
     camera = np.repeat(np.arange(len(messages)), counts)
     rows = np.concatenate([np.arange(count) for count in counts])
-    corners = np.concatenate([np.reshape(message.boxes_px, (-1, 4)) for message in messages]).astype(float)
-    scores = np.concatenate([message.scores for message in messages]).astype(float)
+    corners = np.concatenate([message.boxes_px.reshape(-1, 4) for message in messages]).astype(float, copy=False)
+    scores = np.concatenate([message.scores for message in messages]).astype(float, copy=False)
     keep = named & np.isfinite(corners).all(axis=1) & np.isfinite(scores)
     keep &= (corners[:, 2] > corners[:, 0]) & (corners[:, 3] > corners[:, 1])
     kept = np.flatnonzero(keep)
@@ -256,7 +255,35 @@ def _pedestrian_boxes(cameras: Sequence[CameraFrame], params: FusionParams) -> _
 
 
 def _matches(
-    people: Outlines, boxes: _Boxes, M: int, params: FusionParams
+    people: Outlines, boxes: _Boxes, C: int, M: int, params: FusionParams
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Returns boxes (P,), clusters (P,) and how well they fit, for each pair that passes the gates."""
-    table = np.full((4, len(people.names), M), np.nan)
+    """Returns boxes (P,), clusters (P,) and how well they fit, for the pairs of one camera that pass the gates.
+
+    Whatever passes touches the box widened by `grown_box`, which is tried first: most pairs are far apart.
+    """
+    table = np.full((4, C, M), np.nan)  # compares as False where nobody is in view
+    table[:, people.camera, people.person] = people.corners_px.T
+    x0, y0, x1, y1 = table[:, boxes.camera]  # (B, M) each
+    u0, v0, u1, v1 = boxes.corners_px.T  # (B,) each
+    wider = 0.5 * (params.grown_box - 1) * (u1 - u0) + 1.0  # a pixel more, for rounding
+    near = (x0 < (u1 + wider)[:, None]) & (x1 > (u0 - wider)[:, None]) & (y0 < v1[:, None]) & (y1 > v0[:, None])
+    box, cluster = np.divmod(np.flatnonzero(near), M)
+    likeness = _likeness(table[:, boxes.camera[box], cluster], boxes.corners_px[box].T, params)
+    fits = np.flatnonzero(likeness)
+    return box[fits], cluster[fits], likeness[fits]
+
+
+def _likeness(outlines_px: FloatArray, boxes_px: FloatArray, params: FusionParams) -> FloatArray:
+    """Returns how well people's outlines (4, P) fit boxes (4, P) of the same camera, pair by pair; 0 past the gates."""
+    x0, y0, x1, y1 = outlines_px
+    u0, v0, u1, v1 = boxes_px
+    width, height = x1 - x0, np.maximum(y1 - y0, 1e-9)
+    box_width, box_height = u1 - u0, v1 - v0
+    shared_x = np.minimum(x1, u1) - np.maximum(x0, u0)
+    shared_y = np.minimum(y1, v1) - np.maximum(y0, v0)
+    overlap = np.maximum(shared_x, 0.0) / np.maximum(width + box_width - shared_x, 1e-9)
+    inside = np.abs(x0 + x1 - u0 - u1) <= params.grown_box * box_width
+    inside &= np.abs(y0 + y1 - v0 - v1) <= params.grown_box * box_height
+    ratio = np.log(box_height / height) / params.max_height_log_ratio
+    gate = ((overlap >= params.min_overlap) | inside) & (shared_y > 0) & (np.abs(ratio) < 1)
+    return np.where(gate, (0.1 + overlap) * np.exp(-2 * ratio * ratio), 0.0)

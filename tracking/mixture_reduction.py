@@ -94,7 +94,9 @@ def merge(mixture: GaussianMixture, distance: float, components_per_label: int) 
     several[1:] = repeated
     several[:-1] |= repeated
     rest = select(mixture, several)
-    together = concatenate(select(mixture, ~several), _moment_match(rest, _pivots(rest, distance, components_per_label)))
+    together = concatenate(
+        select(mixture, ~several), _moment_match(rest, _pivots(rest, distance, components_per_label))
+    )
     return select(together, np.lexsort((-together.weights, together.labels)))
 
 

@@ -41,7 +41,8 @@ def outlines(
     rig = make_rig(tuple(camera.model for camera in cameras))
     camera_from_map = np.array([camera.camera_from_map for camera in cameras])  # (C, 4, 4)
     eyes = inverse(camera_from_map)[:, :2, 3]  # (C, 2)
-    camera, person = _in_cone(camera_from_map, rig.view_rad, positions_m, ground_m, radius_m, height_m)
+    view_rad = np.array([camera.model.view_rad for camera in cameras])
+    camera, person = _in_cone(camera_from_map, view_rad, positions_m, ground_m, radius_m, height_m)
 
     place = positions_m[camera, person]  # (P, 2)
     toward = place - eyes[camera]

@@ -1,7 +1,6 @@
 """The bus: keys that carry a model's identity, and sessions that open where they are told or say why not."""
 
 import json
-import os
 import socket
 import time
 from pathlib import Path
@@ -43,7 +42,7 @@ def test_two_sessions_meet_on_a_private_socket(tmp_path):
 
 def listening_ports():
     """Returns the TCP ports and bound UDP ports of this process, from Linux's own tables."""
-    ours = {os.readlink(link) for link in Path("/proc/self/fd").iterdir() if os.path.lexists(link)}
+    ours = {str(link.readlink()) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()}
     ports = set()
     for table in ("tcp", "tcp6", "udp", "udp6"):
         for line in (Path("/proc/net") / table).read_text().splitlines()[1:]:

@@ -70,14 +70,13 @@ def test_generator_agrees_with_the_torch_one(make_generator, make_scene, config,
     assert_same(wanted, found, atol=1e-5)
 
 
-@pytest.mark.parametrize("scale", [3, 10])
-def test_agreement_outlasts_large_weights(make_generator, make_scene, scale):
+def test_agreement_outlasts_larger_weights(make_generator, make_scene):
     generator = make_generator()
     with torch.no_grad():
         for weights in generator.parameters():
-            weights.mul_(scale)  # gates, attention and sigmas at their limits
+            weights.mul_(3)  # gates, attention and sigmas at their limits
     wanted, found, _ = both(generator, *make_scene(30))
-    assert_same(wanted, found, atol=1e-5 * scale**3)
+    assert_same(wanted, found, atol=1e-5)
 
 
 def test_somebody_at_rest_has_the_scene_for_a_frame(make_generator, make_scene):

@@ -136,7 +136,11 @@ def test_salvage_is_exit_3_and_without_it_exit_2(inline, short_drive, edit_log, 
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [(None, "cannot be read: No such file or directory"), (b"", "the file is empty"), (b"text" * 99, "is not a readable")],
+    [
+        (None, "cannot be read: No such file or directory"),
+        (b"", "the file is empty"),
+        (b"text" * 99, "is not a readable"),
+    ],
     ids=["missing", "empty", "text"],
 )
 def test_a_log_that_is_none_is_one_line_and_nothing_is_written(inline, tmp_path, content, words):
@@ -184,7 +188,7 @@ def test_a_corrupt_checkpoint_is_one_line_naming_the_file(pcgan, short_drive, tm
     assert not list(tmp_path.glob("out*"))
 
 
-def test_options_that_exclude_each_other(inline, pcgan, short_drive):
+def test_options_that_exclude_each_other(inline, short_drive):
     outcome = inline(short_drive, "--connect", "tcp/127.0.0.1:1")
     assert (outcome.code, one_line(outcome.err)) == (2, "pcgan: --connect goes with --predictor external")
     outcome = inline(short_drive, "--rrd", "a.rrd", "--view")
@@ -204,7 +208,9 @@ def test_a_view_that_cannot_be_written_is_one_line(inline, short_drive, tmp_path
 
 @pytest.mark.parametrize("option", ["--json", "--picture"])
 def test_what_cannot_be_written_beside_the_output_is_one_line(inline, short_drive, tmp_path, option):
-    outcome = inline(short_drive, "-o", tmp_path / "out.mcap", "--duration", "0.5", option, tmp_path / "no" / "file.png")
+    outcome = inline(
+        short_drive, "-o", tmp_path / "out.mcap", "--duration", "0.5", option, tmp_path / "no" / "file.png"
+    )
     assert outcome.code == 2
     assert "file.png" in one_line(outcome.err)
     assert (tmp_path / "out.mcap").is_file()
@@ -242,7 +248,15 @@ def test_a_full_disk_is_one_line_and_at_most_a_part(short_drive, model, tmp_path
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     process = start_pcgan(
-        "replay", short_drive, "-o", tmp_path / "out.mcap", "--predictor", "inline", "--model", model, preexec_fn=limited
+        "replay",
+        short_drive,
+        "-o",
+        tmp_path / "out.mcap",
+        "--predictor",
+        "inline",
+        "--model",
+        model,
+        preexec_fn=limited,
     )
     _, err = process.communicate(timeout=60)
     assert process.returncode == 2, err

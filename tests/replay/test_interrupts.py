@@ -15,48 +15,78 @@ def send(signum):
     os.kill(os.getpid(), signum)
 
 
+def interrupted(work):
+    """Does some work with an Interrupts; returns what interrupted it."""
+    with pytest.raises(Interrupted) as interruption:
+        enter(work)
+    return interruption.value
+
+
+def enter(work):
+    with Interrupts() as interrupts:
+        work(interrupts)
+
+
 @pytest.mark.parametrize("signum", SIGNALS)
 def test_a_signal_interrupts_at_once(signum):
-    with pytest.raises(Interrupted) as interruption, Interrupts():
+    done = []
+
+    def work(_):
         send(signum)
-        pytest.fail("the signal was not noticed")
-    assert interruption.value.signum == signum
-    assert str(interruption.value) == signal.Signals(signum).name
+        done.append("after it")
+
+    found = interrupted(work)
+    assert (found.signum, str(found), done) == (signum, signal.Signals(signum).name, [])
 
 
 @pytest.mark.parametrize("signum", SIGNALS)
 def test_a_shielded_block_is_finished_first(signum):
     done = []
-    with pytest.raises(Interrupted) as interruption, Interrupts() as interrupts:
+
+    def work(interrupts):
         with interrupts.shield():
             send(signum)
             done.append("block")
         done.append("after it")
+
+    assert interrupted(work).signum == signum
     assert done == ["block"]
-    assert interruption.value.signum == signum
 
 
 def test_between_blocks_a_signal_interrupts_at_once():
     done = []
-    with pytest.raises(Interrupted), Interrupts() as interrupts:
+
+    def work(interrupts):
         with interrupts.shield():
             done.append(1)
         send(signal.SIGINT)
         done.append(2)
+
+    interrupted(work)
     assert done == [1]
 
 
 def test_once_ignored_a_signal_changes_nothing():
-    with Interrupts() as interrupts:
+    done = []
+
+    def work(interrupts):
         interrupts.ignore()
         for signum in SIGNALS:
             send(signum)
+            done.append(signum)
+
+    enter(work)
+    assert done == SIGNALS
 
 
 def test_an_error_in_a_shielded_block_is_not_hidden_by_a_signal():
-    with pytest.raises(OSError, match="disk full"), Interrupts() as interrupts, interrupts.shield():
-        send(signal.SIGINT)
-        raise OSError("disk full")
+    def work(interrupts):
+        with interrupts.shield():
+            send(signal.SIGINT)
+            raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        enter(work)
 
 
 def test_the_handlers_of_before_are_put_back():

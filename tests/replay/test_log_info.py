@@ -30,7 +30,11 @@ def test_a_drive_is_described(short_drive):
     assert description["missing"] == []
     assert description["duration_s"] == pytest.approx(3.0, abs=0.2)
     scans = rows(description)[CLUSTERS_TOPIC]
-    assert (scans["schema"], scans["encoding"], scans["role"]) == ("pcgan.v1.LidarClusters", "protobuf", "lidar clusters")
+    assert (scans["schema"], scans["encoding"], scans["role"]) == (
+        "pcgan.v1.LidarClusters",
+        "protobuf",
+        "lidar clusters",
+    )
     assert scans["count"] == 30
     assert scans["rate_hz"] == pytest.approx(10, rel=0.1)
     poses = rows(description)[ODOMETRY_TOPIC]
@@ -52,7 +56,9 @@ def test_delays_and_skews_in_closed_form(make, make_log, logged):
 
 
 def test_delays_are_taken_from_the_first_seconds(make, make_log, logged):
-    messages = [logged(ODOMETRY_TOPIC, make.stamp(t + (10 if t < 2000 else 500)), make.pose(t)) for t in range(1000, 9000, 50)]
+    messages = [
+        logged(ODOMETRY_TOPIC, make.stamp(t + (10 if t < 2000 else 500)), make.pose(t)) for t in range(1000, 9000, 50)
+    ]
     messages.append(logged(CLUSTERS_TOPIC, make.stamp(9900), make.scan(9800)))
     path = make_log(messages)
     assert rows(describe_log([path], seconds=0.9))[ODOMETRY_TOPIC]["delay_ms"]["p99"] == 10

@@ -2,6 +2,7 @@
 
 import os
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -21,12 +22,14 @@ def frame(make):
     return made
 
 
-def written(path, frames, lineage=None, settings=b""):
+def written(path, frames, lineage=None, settings=b"", ending=None):
     with LogWriter(path) as writer:
         for frame in frames:
             writer.write(frame)
         if lineage:
             writer.describe(lineage, settings)
+        if ending:
+            raise ending
     return path
 
 
@@ -57,7 +60,9 @@ def test_schemas_travel_inside_the_file(tmp_path, frame):
     with path.open("rb") as stream:
         decoded = {
             channel.topic: message
-            for _, channel, _, message in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+            for _, channel, _, message in make_reader(
+                stream, decoder_factories=[DecoderFactory()]
+            ).iter_decoded_messages()
         }
     assert decoded["/pcgan/predictions"].predictions[0].track_id == 4
     assert len(decoded["/pcgan/predictions"].predictions[0].paths[0].x) == 12
@@ -94,26 +99,22 @@ def test_until_it_is_whole_the_file_is_called_part(tmp_path, frame):
 def test_an_old_output_stays_until_the_new_one_is_whole(tmp_path, frame):
     path = tmp_path / "out.mcap"
     path.write_bytes(b"old")
-    with pytest.raises(RuntimeError), LogWriter(path) as writer:
-        writer.write(frame(0))
-        raise RuntimeError
+    with pytest.raises(RuntimeError):
+        written(path, [frame(0)], ending=RuntimeError)
     assert path.read_bytes() == b"old"
     assert (tmp_path / "out.mcap.part").exists()
 
 
 def test_after_an_error_the_part_holds_what_was_written(tmp_path, frame, mcap_content):
-    with pytest.raises(RuntimeError), LogWriter(tmp_path / "out.mcap") as writer:
-        writer.write(frame(0))
-        writer.write(frame(1))
-        raise RuntimeError
+    with pytest.raises(RuntimeError):
+        written(tmp_path / "out.mcap", [frame(0), frame(1)], ending=RuntimeError)
     assert [path.name for path in tmp_path.iterdir()] == ["out.mcap.part"]
     assert len(mcap_content(tmp_path / "out.mcap.part").messages) == 8
 
 
 def test_ctrl_c_closes_the_file_under_its_name(tmp_path, frame, mcap_content):
-    with pytest.raises(KeyboardInterrupt), LogWriter(tmp_path / "out.mcap") as writer:
-        writer.write(frame(0))
-        raise KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt):
+        written(tmp_path / "out.mcap", [frame(0)], ending=KeyboardInterrupt)
     assert [path.name for path in tmp_path.iterdir()] == ["out.mcap"]
     assert len(mcap_content(tmp_path / "out.mcap").messages) == 4
 
@@ -153,7 +154,7 @@ def test_a_file_where_a_folder_should_be(tmp_path):
         LogWriter(tmp_path / "file" / "out.mcap")
 
 
-def test_a_folder_under_the_outputs_own_name(tmp_path, frame):
+def test_a_folder_under_the_outputs_own_name(tmp_path):
     """Found out before a long run, not after it."""
     (tmp_path / "out.mcap").mkdir()
     with pytest.raises(OutputError, match=r"out\.mcap .*: Is a directory"):
@@ -161,12 +162,11 @@ def test_a_folder_under_the_outputs_own_name(tmp_path, frame):
     assert [path.name for path in tmp_path.iterdir()] == ["out.mcap"]
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 @pytest.mark.parametrize("frames", [0, 1, 400])
 def test_a_full_disk_is_one_error_and_no_output(tmp_path, frame, frames):
     """The part is a link to a device that is always full."""
     (tmp_path / "out.mcap.part").symlink_to("/dev/full")
-    with pytest.raises(OutputError, match=r"out\.mcap c.* No space left on device"), LogWriter(tmp_path / "out.mcap") as w:
-        for i in range(frames):
-            w.write(frame(i))
+    with pytest.raises(OutputError, match=r"out\.mcap c.* No space left on device"):
+        written(tmp_path / "out.mcap", [frame(i) for i in range(frames)])
     assert not (tmp_path / "out.mcap").exists()

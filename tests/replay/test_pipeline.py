@@ -1,4 +1,4 @@
-"""Sensor frames -> tracks -> predictions, with a predictor that is a plain object: order, window, epochs, late scans."""
+"""Sensor frames -> tracks -> predictions, with a plain object as predictor: order, window, epochs, late scans."""
 
 from collections import deque
 from dataclasses import replace
@@ -91,7 +91,9 @@ def test_results_come_while_frames_still_do(frames):
 
 def test_unpublished_frames_warm_the_tracker_up_and_have_no_sequence(frames):
     given = [frames(i) for i in range(20)]
-    results = list(run_pipeline(given, tracker(), Echo(), published=lambda f: f.sensors.stamp_ns >= given[10].sensors.stamp_ns))
+    results = list(
+        run_pipeline(given, tracker(), Echo(), published=lambda f: f.sensors.stamp_ns >= given[10].sensors.stamp_ns)
+    )
     full = list(run_pipeline(given, tracker(), Echo()))
     assert [r.tracks.sequence for r in results] == list(range(10))
     for warm, cold in zip(results, full[10:], strict=True):

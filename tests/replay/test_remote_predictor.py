@@ -101,7 +101,7 @@ def test_answers_come_in_the_order_of_the_questions(asker, server, frame, make):
     assert predictor.restarts == 0
 
 
-def test_the_pose_goes_out_on_its_own_key(asker, server, endpoint, frame, make):
+def test_the_pose_goes_out_on_its_own_key(asker, server, frame, make):
     predictor, double = asker(), server()
     with double.session.declare_subscriber(topics.zenoh_key(topics.VEHICLE_POSE)) as poses:
         ready(predictor)
@@ -206,9 +206,7 @@ def test_failures_are_counted_in_a_row(asker, server, frame, make):
 
 
 def test_no_predictor_at_all_says_how_to_start_one(endpoint):
-    with pytest.raises(
-        PredictorError, match=r"^no predictor was ready within 0\.3 s; start one with: pcgan predict$"
-    ):
+    with pytest.raises(PredictorError, match=r"^no predictor was ready within 0\.3 s; start one with: pcgan predict$"):
         RemotePredictor.external(endpoint, startup_s=0.3)
 
 
@@ -218,7 +216,7 @@ def test_a_predictor_with_other_weights_is_no_replacement(asker, server, frame, 
     first.stop()
     server(Double(), bus.ModelIdentity("other", "11"))
     ask(predictor, [frame(0)], make)
-    with pytest.raises(PredictorError, match="^the new predictor runs other, the one before ran double$"):
+    with pytest.raises(PredictorError, match=r"^the new predictor runs other, the one before ran double$"):
         predictor.answer()
 
 
@@ -231,7 +229,7 @@ def test_an_answer_that_makes_no_sense_is_an_error(asker, server, frame, make):
     server(Mad())
     ready(predictor)
     ask(predictor, [frame(0)], make)
-    with pytest.raises(PredictorError, match="^the predictor's answer makes no sense: PredictionFrame dt_s"):
+    with pytest.raises(PredictorError, match=r"^the predictor's answer makes no sense: PredictionFrame dt_s"):
         predictor.answer()
 
 

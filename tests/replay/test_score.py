@@ -1,11 +1,13 @@
 """The score in closed form: perfect, a metre off, coasting, lost ids, and the ground truth's people."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from replay.score import MATCH_M, Errors, ReplayScore
+from schemas.messages import ModalPath
 
 P = 3  # predicted steps, 0.1 s each, as far apart as the frames
 
@@ -18,7 +20,7 @@ def walk(at_s, start=(5.0, 2.0), velocity=(1.2, -0.5)):
 def drive(make):
     """Makes frame results of one walker with a prediction each; `off` shifts the predicted paths."""
 
-    def made(count=20, *, off=(0.0, 0.0), coasting=(), velocity=(1.2, -0.5), id_of=lambda i: 1, **changes):
+    def made(count=20, *, off=(0.0, 0.0), coasting=(), velocity=(1.2, -0.5), id_of=lambda _: 1, **changes):
         for i in range(count):
             state = (*walk(0.1 * i, velocity=velocity), *velocity)
             track = make.track(100 * i, id_of(i), state, coasting=i in coasting)
@@ -81,13 +83,9 @@ def test_fde_is_the_last_step_alone(make):
     assert figures["fde_m"] == pytest.approx(0.3)
 
 
-def test_the_most_probable_path_is_scored(make, drive):
+def test_the_most_probable_path_is_scored(drive):
     def swapped(frame):
         (prediction,) = frame.predictions.predictions
-        from dataclasses import replace
-
-        from schemas.messages import ModalPath
-
         (right,) = prediction.paths
         paths = (ModalPath(0.6, right.points_m), ModalPath(0.4, right.points_m + 5))
         answered = replace(frame.predictions, predictions=(replace(prediction, paths=paths),))
@@ -164,7 +162,7 @@ def test_frames_without_people_are_fine(make):
 
 def test_predictions_are_compared_with_the_person_a_track_stands_for(drive, make):
     """The tracks are 0.3 m beside the person; a perfect path of the track is 0.3 m off the person's."""
-    figures = scored(drive(truth=lambda i: make.truth(100 * i, [(42, *(walk(0.1 * i) + [0.3, 0]))])))
+    figures = scored(drive(truth=lambda i: make.truth(100 * i, [(42, *(np.add(walk(0.1 * i), (0.3, 0))))])))
     assert figures["ade_m"] == pytest.approx(0, abs=1e-9)
     truth = figures["ground_truth"]
     assert truth["scored"] == 20 - P
@@ -177,7 +175,7 @@ def test_predictions_are_compared_with_the_person_a_track_stands_for(drive, make
 
 @pytest.mark.parametrize(("distance_m", "scored_"), [(MATCH_M - 0.01, 20 - P), (MATCH_M + 0.01, 0)])
 def test_a_track_far_from_everybody_stands_for_nobody(drive, make, distance_m, scored_):
-    figures = scored(drive(truth=lambda i: make.truth(100 * i, [(42, *(walk(0.1 * i) + [0, distance_m]))])))
+    figures = scored(drive(truth=lambda i: make.truth(100 * i, [(42, *(np.add(walk(0.1 * i), (0, distance_m))))])))
     assert figures["ground_truth"]["scored"] == scored_
 
 

@@ -1,7 +1,7 @@
 """A replay as a library: frames in order, warm-up, what is refused on the way, and that nothing but the log decides."""
 
 import threading
-from collections import Counter
+import time
 
 import numpy as np
 import pytest
@@ -97,8 +97,6 @@ def test_the_rate_changes_nothing(short_drive, model, recorded, digest):
 
 
 def test_the_rate_is_kept(short_drive, model, recorded):
-    import time
-
     start = time.monotonic()
     run(short_drive, model, rate=10.0)
     first, last = recorded.frames[0].log_time_ns, recorded.frames[-1].log_time_ns
@@ -173,11 +171,11 @@ def test_calibrations_and_mounts_that_occur_once_at_the_beginning_are_found(driv
                 yield topic, at_ns, data
 
     frames, refusals = run(edit_log(drive, once), model, ReplaySettings(start_s=5.0))
-    assert refusals.total <= 1  # test_a_start_in_the_middle_refuses_nothing_of_a_healthy_log
+    assert refusals.total == 0
     assert len(frames[0].sensors.cameras) >= 5
 
 
-def test_a_start_past_the_end_says_how_long_the_log_is(short_drive, model):
+def test_a_start_past_the_end_says_how_long_the_log_is(short_drive):
     with pytest.raises(LogError, match=r"nothing to replay from 60 s: the log lasts 3\.\d s"):
         Replay([short_drive], ReplaySettings(start_s=60.0))
 
@@ -221,7 +219,7 @@ def test_a_damaged_extra_message_is_counted_and_changes_nothing(short_drive, mod
 
     frames, refusals = run(edit_log(short_drive, insert), model)
     assert digest(frames) == digest(recorded.frames)
-    ((found_topic, found_reason), count), = refusals.counts.items()
+    (((found_topic, found_reason), count),) = refusals.counts.items()
     assert (found_topic, count) == (topic, 1)
     assert reason in found_reason
     assert topic in refusals.first[0]
@@ -251,7 +249,9 @@ def test_strict_stops_at_the_first(short_drive, model, edit_log):
     def insert(log):
         return [*log[:500], (BOXES, log[499][1], b"\xff\xff\xff"), *log[500:]]
 
-    with pytest.raises(LogError, match=r"/gmsl/A0/detections at .* s refused: .*; without --strict the run would go on"):
+    with pytest.raises(
+        LogError, match=r"/gmsl/A0/detections at .* s refused: .*; without --strict the run would go on"
+    ):
         run(edit_log(short_drive, insert), model, strict=True)
 
 
@@ -267,7 +267,7 @@ def test_every_damaged_message_is_counted_with_its_reason(short_drive, model, ed
     assert len(frames) == expected
     assert {topic for topic, _ in refusals.counts} == {BOXES}
     assert refusals.total > 20
-    assert Counter(dict.fromkeys(refusals.counts, 1)).total() == 1  # one reason
+    assert len(refusals.counts) == 1  # one reason
 
 
 def test_a_scan_that_comes_two_seconds_late_is_counted(drive, model, edit_log, results):

@@ -48,7 +48,10 @@ def test_what_was_refused_and_lost():
 @pytest.mark.parametrize(
     ("stopped", "words"),
     [
-        (PredictorError("the predictor died (exit code 7)"), "stopped early: the predictor died (exit code 7); what was"),
+        (
+            PredictorError("the predictor died (exit code 7)"),
+            "stopped early: the predictor died (exit code 7); what was",
+        ),
         (Interrupted(2), "stopped early: SIGINT arrived; what was written is complete up to there"),
     ],
     ids=["predictor", "signal"],

@@ -167,7 +167,7 @@ def test_a_camera_without_a_calibration_gives_no_evidence(rig, make):
     assert released(r).sensors.cameras == ()
 
 
-def test_each_camera_has_the_pose_of_its_own_stamp(rig, make):
+def test_each_camera_has_the_pose_of_its_own_stamp(rig):
     """The vehicle drives at 2 m/s along x; the camera looked 30 ms after the scan, so 6 cm farther on."""
     r = rig()
     r.poses(*range(900, 1100, 10))
@@ -203,9 +203,7 @@ def test_a_scan_without_a_pose_is_refused_and_counted(rig):
     r.poses(*range(900, 940, 10))
     r.scan(1000)
     assert list(r.sync.flush()) == []
-    assert r.refusals.as_json() == [
-        {"topic": "lidar clusters", "reason": "no vehicle pose within 50 ms", "count": 1}
-    ]
+    assert r.refusals.as_json() == [{"topic": "lidar clusters", "reason": "no vehicle pose within 50 ms", "count": 1}]
 
 
 def test_a_scan_before_the_first_pose_is_refused_and_the_next_is_not(rig, make):

@@ -1,5 +1,6 @@
 """The codec: everything comes back as it went in, the bytes are protobuf's own, and nonsense is refused by name."""
 
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 
 import numpy as np
@@ -250,7 +251,7 @@ def detections(**changes):
 
 
 def clusters(**changes):
-    values = dict.fromkeys(("x", "y", "z", "size_x", "size_y", "size_z"), [1.0])
+    values = {name: [1.0] for name in ("x", "y", "z", "size_x", "size_y", "size_z")}
     return pb.LidarClusters(**{"stamp_ns": STAMP_NS, **values, "points": [5], **changes})
 
 
@@ -366,7 +367,7 @@ REFUSED = {
         prediction_frame(pb.Mixture(weight=[1, 1], x=[0, 0], y=[0, 0], sigma_x=[1, 1], sigma_y=[1, 1], rho=[0, 0])),
         "Mixture has 2 entries for 0 components",
     ),
-    "a mixture of another horizon": (PredictionFrame, prediction_frame(mixture(steps=3)), "has a path that is not 3 steps long"),
+    "a mixture of another horizon": (PredictionFrame, prediction_frame(mixture(steps=3)), "that is not 3 steps long"),
     "a NaN mixture": (PredictionFrame, prediction_frame(mixture(rho=[NAN, 0])), r"Mixture\.rho holds NaN or infinity"),
     "a mixture without spread": (PredictionFrame, prediction_frame(mixture(sigma_x=[0, 1])), "sigma that is not pos"),
     "a correlation above 1": (PredictionFrame, prediction_frame(mixture(rho=[1.5, 0])), "Mixture has a correlation"),
@@ -423,10 +424,8 @@ def test_a_flipped_bit_raises_nothing_but_codec_errors(message, data):
     wire = bytearray(codec.encode(message))
     place = data.draw(st.integers(0, len(wire) - 1))
     wire[place] ^= 1 << data.draw(st.integers(0, 7))
-    try:
-        codec.decode(type(message), bytes(wire))
-    except CodecError as error:
-        assert str(error)
+    with suppress(CodecError):
+        assert codec.decode(type(message), bytes(wire)).stamp_ns > 0
 
 
 def test_empty_bytes_are_a_message_without_a_stamp():
