@@ -282,8 +282,8 @@ def train(
     ] = None,
     recipe: Annotated[str, typer.Option(help="paper: as published; best: what ships.")] = "best",
     start_from: Annotated[Path | None, typer.Option(metavar="FILE", help="Fine-tune this checkpoint.")] = None,
-    epochs: Annotated[int, typer.Option(min=1)] = 40,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    epochs: Annotated[int, typer.Option(min=1, metavar="N", help="Passes over the training windows.")] = 40,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Of the weights and of the order of the windows.")] = 0,
 ) -> None:
     """Train a predictor (10 Hz, 8 steps observed, 12 predicted, with the vehicle); resumes where it stopped.
 

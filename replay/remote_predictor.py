@@ -147,6 +147,7 @@ class RemotePredictor:
         self._answers: dict[int, PredictionFrame] = {}
         self._alive: dict[str, ModelIdentity] = {}
         self._model: ModelIdentity | None = None
+        self._left = False
         self._failures = 0
         self.restarts = 0
         self._inbox: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
@@ -223,13 +224,16 @@ class RemotePredictor:
         sequence = next(iter(self._unanswered))
         deadline = time.monotonic() + self._hang_s
         while sequence not in self._answers:
-            try:
-                self._take(self._inbox.get(timeout=_POLL_S))
-            except queue.Empty:
-                reason = self._trouble(time.monotonic() > deadline)
-                if reason is not None:
-                    self._replace(reason)
-                    deadline = time.monotonic() + self._hang_s
+            with contextlib.suppress(queue.Empty):
+                sample = self._inbox.get(timeout=_POLL_S)
+                self._read_news()  # who answers has said before with which weights
+                self._take(sample)
+                if sequence in self._answers:
+                    break
+            reason = self._trouble(time.monotonic() > deadline)
+            if reason is not None:
+                self._replace(reason)
+                deadline = time.monotonic() + self._hang_s
         self._failures = 0
         del self._unanswered[sequence]
         return self._answers.pop(sequence)
@@ -266,7 +270,8 @@ class RemotePredictor:
         self._read_news()
         if self._child is not None and (ending := self._child.died()) is not None:
             return f"the predictor died ({ending})"
-        if not self._alive:
+        if self._left or not self._alive:
+            self._left = False
             return "the predictor has left the bus"
         return f"the predictor did not answer within {self._hang_s:g} s" if silent else None
 
@@ -306,17 +311,21 @@ class RemotePredictor:
                     f"no predictor was ready within {self._startup_s:g} s; start one with: pcgan predict"
                 )
             time.sleep(0.005)
-        found = next(iter(self._alive.values()))
-        if self._model is not None and found != self._model:
-            raise PredictorError(f"the new predictor runs {found.name}, the one before ran {self._model.name}")
-        self._model = found
+        self._left = False
+        models = set(self._alive.values())
+        if len(models) > 1:
+            raise PredictorError(f"predictors of different weights are on the bus: {sorted(m.name for m in models)}")
+        self._model = models.pop()
 
     def _read_news(self) -> None:
         for kind, key in _drained(self._news):
             if kind == zenoh.SampleKind.PUT:
-                self._alive[key] = model_of(key)
-            else:
-                self._alive.pop(key, None)
+                found = model_of(key)
+                if self._model is not None and found != self._model:
+                    raise PredictorError(f"the new predictor runs {found.name}, the one before ran {self._model.name}")
+                self._alive[key] = found
+            elif self._alive.pop(key, None) is not None:
+                self._left = True  # what it had not answered is lost, even if another has come since
 
 
 def _drained(news: "queue.SimpleQueue[tuple[zenoh.SampleKind, str]]") -> Iterator[tuple[zenoh.SampleKind, str]]:

@@ -83,8 +83,10 @@ class CameraModel:
         Pixels of the others are NaN, as are those of points that are not finite.
         """
         points = np.asarray(points_camera, float)
-        pixels, valid = project_all(make_rig((self,)), np.zeros(1, np.int64), points.reshape(1, -1, 3))
-        return pixels.reshape(*points.shape[:-1], 2), valid.reshape(points.shape[:-1])
+        pixels, valid = project_all(
+            make_rig((self,)), np.zeros(1, np.int64), points.reshape(-1, 1, 3).transpose(2, 0, 1)
+        )
+        return pixels.reshape(2, -1).T.reshape(*points.shape[:-1], 2), valid.reshape(points.shape[:-1])
 
     def ray(self, pixels: FloatArray) -> FloatArray:
         """Returns unit directions (..., 3) in the optical frame of raw pixels (..., 2): the inverse of `project`.
@@ -159,7 +161,7 @@ class Rig:
     model: IntArray  # (C,)  which of them
     intrinsics: FloatArray  # (5, C)  fx, fy, cx, cy, max_radius
     distortion: FloatArray  # (8, C)  zeros past a model's own
-    size_px: FloatArray  # (C, 2)
+    size_px: FloatArray  # (2, C)
 
 
 @lru_cache(maxsize=16)
@@ -174,22 +176,20 @@ def make_rig(cameras: tuple[CameraModel, ...]) -> Rig:
         np.array([models.index(c.model) for c in cameras], np.int64),
         np.array([(c.fx, c.fy, c.cx, c.cy, c.max_radius) for c in cameras]).reshape(-1, 5).T.copy(),
         distortion,
-        np.array([(c.width_px, c.height_px) for c in cameras], float).reshape(-1, 2),
+        np.array([(c.width_px, c.height_px) for c in cameras], float).reshape(-1, 2).T.copy(),
     )
 
 
 def project_all(rig: Rig, camera: IntArray, points_camera: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Projects points (R, N, 3), row r in the optical frame of the rig's camera[r]; see `CameraModel.project`.
+    """Projects points (3, N, R), column r in the optical frame of the rig's camera[r]; see `CameraModel.project`.
 
-    Returns pixels (R, N, 2) and the mask (R, N).
+    Returns pixels (2, N, R) and the mask (N, R). Coordinates come first, so that numpy runs along whole rows.
     """
-    points = np.asarray(points_camera, float)
-    fx, fy, cx, cy, max_radius = rig.intrinsics[:, camera, None]  # (R, 1) each
-    z = points[..., 2]
+    fx, fy, cx, cy, max_radius = rig.intrinsics[:, camera]  # (R,) each
+    x, y, z = points_camera
     valid = z >= MIN_DEPTH_M
     depth = np.where(valid, z, 1.0)
-    x: FloatArray = points[..., 0] / depth
-    y: FloatArray = points[..., 1] / depth
+    x, y = x / depth, y / depth
     with np.errstate(over="ignore"):
         r2: FloatArray = x * x + y * y
         valid &= r2 <= max_radius * max_radius  # False for NaN, too
@@ -197,18 +197,18 @@ def project_all(rig: Rig, camera: IntArray, points_camera: FloatArray) -> tuple[
     everywhere = bool(valid.all())
     if not everywhere:
         x, y, r2 = np.where(valid, x, 0.0), np.where(valid, y, 0.0), np.where(valid, r2, 0.0)
-    D = rig.distortion[:, camera, None]  # (8, R, 1)
+    D = rig.distortion[:, camera]  # (8, R)
     if len(rig.models) == 1:
         x, y = _distort(rig.models[0], D, x, y, r2)
     else:
         for number, model in enumerate(rig.models):
-            rows = np.flatnonzero(rig.model[camera] == number)
-            x[rows], y[rows] = _distort(model, D[:, rows], x[rows], y[rows], r2[rows])
-    pixels = np.empty((*points.shape[:2], 2))
-    pixels[..., 0] = fx * x + cx
-    pixels[..., 1] = fy * y + cy
+            columns = np.flatnonzero(rig.model[camera] == number)
+            x[:, columns], y[:, columns] = _distort(model, D[:, columns], x[:, columns], y[:, columns], r2[:, columns])
+    pixels = np.empty((2, *valid.shape))
+    pixels[0] = fx * x + cx
+    pixels[1] = fy * y + cy
     if not everywhere:
-        pixels[~valid] = np.nan
+        pixels[:, ~valid] = np.nan
     return pixels, valid
 
 

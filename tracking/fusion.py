@@ -202,7 +202,7 @@ def _ask_cameras(
     for m, c, row, score in found:
         evidence[m] = (*evidence[m], CameraEvidence(names[c], row, score))
     # No box where a person should have one speaks against a person, as far as there was a view of it.
-    tall = people.corners_px[:, 3] - people.corners_px[:, 1] >= params.min_height_px
+    tall = people.corners_px[3] - people.corners_px[1] >= params.min_height_px
     proves = tall & (people.share_inside >= params.min_in_image) & ~matched[people.camera, people.person]
     expected = params.p_box * visible
     no_box = np.log((1 - expected) / (1 - np.minimum(params.p_box_other, expected)))
@@ -262,7 +262,7 @@ def _matches(
     Whatever passes touches the box widened by `grown_box`, which is tried first: most pairs are far apart.
     """
     table = np.full((4, C, M), np.nan)  # compares as False where nobody is in view
-    table[:, people.camera, people.person] = people.corners_px.T
+    table[:, people.camera, people.person] = people.corners_px
     x0, y0, x1, y1 = table[:, boxes.camera]  # (B, M) each
     u0, v0, u1, v1 = boxes.corners_px.T  # (B,) each
     wider = 0.5 * (params.grown_box - 1) * (u1 - u0) + 1.0  # a pixel more, for rounding

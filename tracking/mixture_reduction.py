@@ -109,18 +109,16 @@ def _pivots(mixture: GaussianMixture, distance: float, components_per_label: int
         first = np.ones(len(rest), bool)
         first[1:] = labels[1:] != labels[:-1]
         pivot = rest[first][np.cumsum(first) - 1]  # the heaviest of each label, beside each of its components
-        if turn == components_per_label - 1:
+        others = np.flatnonzero(~first)
+        if len(others) == 0 or turn == components_per_label - 1:
             pivots[rest] = pivot
             break
         near = first.copy()
-        others = np.flatnonzero(~first)
         delta = mixture.means[rest[others]] - mixture.means[pivot[others]]
         inverse = np.linalg.inv(mixture.covs[pivot[others]])
         near[others] = (delta * (inverse @ delta[:, :, None])[:, :, 0]).sum(axis=1) < distance
         pivots[rest[near]] = pivot[near]
         rest = rest[~near]
-        if len(rest) == 0:
-            break
     return pivots
 
 

@@ -20,7 +20,7 @@ class Outlines:
 
     camera: IntArray  # (P,)
     person: IntArray  # (P,)
-    corners_px: FloatArray  # (P, 4)  cut at the image's border
+    corners_px: FloatArray  # (4, P)  cut at the image's border
     share_inside: FloatArray  # (P,)  of the box before the cut, above 0
 
 
@@ -53,17 +53,17 @@ def outlines(
     corners[:, :, 0, :2], corners[:, :, 1, :2] = (place - side)[:, None], (place + side)[:, None]
     corners[..., 2] = (ground_m[person, None] + height_m * np.array([0.0, 0.5, 1.0]))[:, :, None]
     R, t = camera_from_map[:, :3, :3].swapaxes(1, 2)[camera], camera_from_map[camera, None, :3, 3]
-    pixels, valid = project_all(rig, camera, corners.reshape(-1, 6, 3) @ R + t)
+    points = np.ascontiguousarray((corners.reshape(-1, 6, 3) @ R + t).transpose(2, 1, 0))  # (3, 6, P)
+    pixels, valid = project_all(rig, camera, points)
 
-    low = np.fmin.reduce(pixels, axis=1)  # (P, 2); fmin and fmax pass over the NaN of corners that are not seen
+    low = np.fmin.reduce(pixels, axis=1)  # (2, P); fmin and fmax pass over the NaN of corners that are not seen
     high = np.fmax.reduce(pixels, axis=1)
-    area = (high[:, 0] - low[:, 0]) * (high[:, 1] - low[:, 1])
-    limits = rig.size_px[camera]
+    area = np.maximum((high[0] - low[0]) * (high[1] - low[1]), 1e-9)
+    limits = rig.size_px[:, camera]
     low, high = np.minimum(np.maximum(low, 0.0), limits), np.minimum(np.maximum(high, 0.0), limits)
-    share = (high[:, 0] - low[:, 0]) * (high[:, 1] - low[:, 1]) / np.maximum(area, 1e-9)
-    seen = np.flatnonzero((share > 0) & (valid.sum(axis=1) >= 4))
-    corners_px = np.concatenate([low[seen], high[seen]], axis=1)
-    return Outlines(camera[seen], person[seen], corners_px, share[seen])
+    share = (high[0] - low[0]) * (high[1] - low[1]) / area
+    seen = np.flatnonzero((share > 0) & (np.add.reduce(valid, axis=0) >= 4))
+    return Outlines(camera[seen], person[seen], np.concatenate([low, high])[:, seen], share[seen])
 
 
 def _in_cone(

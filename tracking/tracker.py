@@ -13,7 +13,7 @@ from tracking import gm_phd
 from tracking.gm_phd import FilterParams
 from tracking.measurements import Measurements, PredictedTracks, no_predicted_tracks
 from tracking.mixture_reduction import GaussianMixture, concatenate, empty_mixture, label_mass, select
-from tracking.motion_model import process_noise, transition
+from tracking.motion_model import process_noise
 from tracking.track_table import History, Labels, append, extend, new_labels, no_history, no_labels, take
 
 DetectionProbability = Callable[[FloatArray], FloatArray] | float
@@ -299,9 +299,10 @@ class Tracker:
         heaviest = np.searchsorted(state.mixture.labels, rows)
         means, covs = state.mixture.means[heaviest], state.mixture.covs[heaviest]
         dt_s = (stamp_ns - state.stamp_ns) * 1e-9
-        F, Q = transition(dt_s), process_noise(abs(dt_s), self.params.filter.acceleration_mps2)
-        covs = F @ covs @ F.T + Q
-        return PredictedTracks(means[:, :2] + dt_s * means[:, 2:], means[:, 2:], covs[:, :2, :2])
+        Q = process_noise(dt_s, self.params.filter.acceleration_mps2)
+        cross = covs[:, :2, 2:]
+        covs = covs[:, :2, :2] + dt_s * (cross + cross.swapaxes(1, 2)) + dt_s**2 * covs[:, 2:, 2:] + Q[:2, :2]
+        return PredictedTracks(means[:, :2] + dt_s * means[:, 2:], means[:, 2:], covs)
 
     def _publish(self, state: TrackerState) -> tuple[Track, ...]:
         labels, history, params = state.labels, state.history, self.params

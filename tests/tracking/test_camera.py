@@ -143,3 +143,15 @@ def test_calibration_cannot_be_changed_behind_the_model():
     camera = CameraModel.from_calibration(make_calibration(distortion=distortion))
     distortion[0] = 9.0
     assert camera.distortion[0] == A0[0]
+
+
+@pytest.mark.parametrize(("model", "D"), [("plumb_bob", [0, 0, 0, 0]), ("equidistant", [0, 0, 0, 0])])
+def test_the_view_ends_at_the_corner_farthest_from_the_centre(model, D):
+    camera = CameraModel(1000, 800, 500, 500, 400, 300, model, np.array(D, float))
+    radius = np.hypot(600, 500) / 500
+    assert camera.view_rad == pytest.approx(np.arctan(radius) if model == "plumb_bob" else radius)
+
+
+def test_a_view_wider_than_the_distortion_allows_ends_with_it():
+    camera = CameraModel(2000, 2000, 300, 300, 1000, 1000, "plumb_bob", np.array([-0.3, 0.0, 0.0, 0.0]))
+    assert camera.view_rad == camera.max_theta_rad
