@@ -22,8 +22,11 @@ def mhd(predicted_m: FloatArray, true_m: FloatArray) -> FloatArray:
     prediction that is on the right line but early or late. The two paths may differ in length.
     """
     _require_paths(predicted_m, true_m)
-    between = np.linalg.norm(predicted_m[..., :, None, :] - true_m[..., None, :, :], axis=-1)  # (..., P, Q)
-    return np.asarray(np.maximum(between.min(axis=-1).mean(axis=-1), between.min(axis=-2).mean(axis=-1)))
+    x = predicted_m[..., :, None, 0] - true_m[..., None, :, 0]  # (..., P, Q)
+    y = predicted_m[..., :, None, 1] - true_m[..., None, :, 1]
+    squared = x * x + y * y  # roots are taken of the nearest only
+    nearest = (np.sqrt(squared.min(axis=-1)).mean(axis=-1), np.sqrt(squared.min(axis=-2)).mean(axis=-1))
+    return np.asarray(np.maximum(*nearest))
 
 
 def nll(
@@ -41,14 +44,17 @@ def nll(
         log_weights = np.log(weights)
     log_norm = np.log(2 * np.pi * sigmas_m[..., 0] * sigmas_m[..., 1] * np.sqrt(one_minus_rho2))
     log_density = log_weights - log_norm - 0.5 * mahalanobis2
-    return np.asarray(-np.logaddexp.reduce(log_density, axis=-1).mean(axis=-1))
+    highest = log_density.max(axis=-1, keepdims=True)  # a weight of 0 gives exp(-inf), never all of them
+    log_sum = np.log(np.exp(log_density - highest).sum(axis=-1)) + highest[..., 0]
+    return np.asarray(-log_sum.mean(axis=-1))
 
 
 def _distances(predicted_m: FloatArray, true_m: FloatArray) -> FloatArray:
     _require_paths(predicted_m, true_m)
     if predicted_m.shape[-2] != true_m.shape[-2]:
         raise ValueError(f"paths have {predicted_m.shape[-2]} and {true_m.shape[-2]} steps; they must agree")
-    return np.asarray(np.linalg.norm(predicted_m - true_m, axis=-1))
+    difference = predicted_m - true_m
+    return np.asarray(np.hypot(difference[..., 0], difference[..., 1]))
 
 
 def _require_paths(*paths_m: FloatArray) -> None:

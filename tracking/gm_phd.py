@@ -132,10 +132,11 @@ def own(component_labels: IntArray, pairs: Pairs, pair_weights: FloatArray) -> B
     M = int(pairs.measurement.max()) + 1
     edge = label * M + pairs.measurement  # (P,)  several components of a label give one edge
     edges = np.flatnonzero(np.bincount(edge))
-    mass = np.bincount(edge, pair_weights)
+    mass = np.bincount(edge, pair_weights).astype(float, copy=False)
     owned = np.zeros(len(mass), bool)
     owned[edges] = assign(edges // M, edges % M, mass[edges])
-    return owned[edge]
+    owned_pairs: BoolArray = owned[edge]
+    return owned_pairs
 
 
 def update(
