@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 import zenoh
+from threadpoolctl import threadpool_limits
 
 from pcgan.bus import ENCODING, MAX_PAYLOAD_BYTES, ModelIdentity, alive_key
 from schemas import codec, topics
@@ -105,7 +106,8 @@ def run(
         signal.signal(ending, lambda *_: inbox.close())
     if end_with_stdin:
         threading.Thread(target=_close_with_stdin, args=(inbox,), daemon=True).start()
-    return serve(session, predictor, model, inbox, namespace=namespace)
+    with threadpool_limits(1):  # sums in BLAS depend on how many threads share them
+        return serve(session, predictor, model, inbox, namespace=namespace)
 
 
 def _close_with_stdin(inbox: Inbox) -> None:

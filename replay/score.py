@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from pcgan import metrics
 from pcgan.extrapolation import extrapolate
 from replay.frame_result import FrameResult
-from schemas.messages import BoolArray, FloatArray, GroundTruthFrame, IntArray, Track
+from schemas.messages import BoolArray, FloatArray, GroundTruthFrame, IntArray, Prediction, Track
 from tracking.metrics import ScoredFrame, score
 
 MAX_GAP_NS = 350_000_000  # a position is interpolated between measurements at most this far apart
@@ -54,17 +54,18 @@ class Positions:
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """The network's predictions of one frame and the extrapolations beside them; A rows."""
+    """The network's predictions of one frame, and what they were made from; A of each."""
 
     stamp_ns: int
-    steps_ns: IntArray  # (A, P)  stamps of the predicted steps
-    track_ids: IntArray  # (A,)
+    dt_s: float
+    tracks: list[Track]
+    predictions: list[Prediction]
     person_ids: IntArray  # (A,)  whom the track stands for in the ground truth; -1 for nobody
-    paths_m: FloatArray  # (A, P, 2)  most probable path
-    mixtures: tuple[
-        FloatArray, FloatArray, FloatArray, FloatArray
-    ]  # weights (A, P, K), means (A, P, K, 2), sigmas (A, P, K, 2), correlations
-    extrapolated: tuple[FloatArray, ...]  # paths (A, P, 2), sigmas (A, P, 2), correlations (A, P)
+
+    @property
+    def last_step_ns(self) -> int:
+        """Stamp of the last predicted step."""
+        return self.stamp_ns + round(self.dt_s * 1e9 * len(self.predictions[0].mixture.weights))
 
 
 class ReplayScore:
@@ -149,62 +150,70 @@ class ReplayScore:
         if not rows:
             return
         tracks = [result.tracks.tracks[i] for i in rows]
-        paths = np.array([predictions[i].paths[0].points_m for i in rows])
-        mixtures = [predictions[i].mixture for i in rows]
-        stacked = (
-            np.array([mixture.weights for mixture in mixtures], float),
-            np.array([mixture.means_m for mixture in mixtures], float),
-            np.array([mixture.sigmas_m for mixture in mixtures], float),
-            np.array([mixture.rhos for mixture in mixtures], float),
-        )
-        states = np.array([track.state for track in tracks])
-        covariances = np.array([track.covariance for track in tracks])
-        dt_s = result.predictions.dt_s
-        ids = np.array([track.id for track in tracks], np.int64)
-        extrapolated = extrapolate(states, covariances, dt_s, paths.shape[1])
-        stamp_ns, (A, P) = result.tracks.stamp_ns, paths.shape[:2]
-        steps_ns = stamp_ns + np.round(dt_s * 1e9 * np.arange(1, P + 1)).astype(np.int64)
-        every_step_ns = np.broadcast_to(steps_ns, (A, P))
-        self._asked.append(_Asked(stamp_ns, every_step_ns, ids, person_of[rows], paths, stacked, extrapolated))
+        asked = [predictions[i] for i in rows]
+        self._asked.append(_Asked(result.tracks.stamp_ns, result.predictions.dt_s, tracks, asked, person_of[rows]))
 
     def _settle(self, now_ns: int | None) -> None:
         """Scores the predictions whose last step lies far enough back; all of them without a present time.
 
         Several frames at once: they are small, and numpy's cost is per call.
         """
-        due = [asked for asked in self._asked if now_ns is None or asked.steps_ns[0, -1] + MAX_GAP_NS <= now_ns]
+        due = [asked for asked in self._asked if now_ns is None or asked.last_step_ns + MAX_GAP_NS <= now_ns]
         if due and (len(due) >= FRAMES_AT_A_TIME or now_ns is None):
             for _ in due:
                 self._asked.popleft()
-            joined = _joined(due)
-            _compare(
-                joined, joined.track_ids, lookup(self._tracked, joined.track_ids, joined.steps_ns), self.against_tracks
-            )
+            batch = _Batch(due)
+            batch.compare(batch.track_ids, self._tracked, self.against_tracks)
             if self._true:
-                _compare(
-                    joined,
-                    joined.person_ids,
-                    lookup(self._true, joined.person_ids, joined.steps_ns),
-                    self.against_truth,
-                )
+                batch.compare(batch.person_ids, self._true, self.against_truth)
         oldest_ns = self._asked[0].stamp_ns if self._asked else now_ns
         for seen in (self._tracked, self._true):
             while seen and oldest_ns is not None and seen[0].stamp_ns < oldest_ns - MAX_GAP_NS:
                 seen.popleft()
 
 
-def _joined(asked: Sequence[_Asked]) -> _Asked:
-    """Returns several frames' predictions as one."""
-    weights, means, sigmas, rhos = (np.concatenate(parts) for parts in zip(*(a.mixtures for a in asked), strict=True))
-    return _Asked(
-        asked[0].stamp_ns,
-        np.concatenate([a.steps_ns for a in asked]),
-        np.concatenate([a.track_ids for a in asked]),
-        np.concatenate([a.person_ids for a in asked]),
-        np.concatenate([a.paths_m for a in asked]),
-        (weights, means, sigmas, rhos),
-        tuple(np.concatenate(parts) for parts in zip(*(a.extrapolated for a in asked), strict=True)),
-    )
+class _Batch:
+    """The predictions of several frames as arrays of N rows, the extrapolated tracks beside them."""
+
+    def __init__(self, asked: Sequence[_Asked]):
+        tracks = [track for frame in asked for track in frame.tracks]
+        predictions = [prediction for frame in asked for prediction in frame.predictions]
+        mixtures = [prediction.mixture for prediction in predictions]
+        N, (P, K) = len(predictions), mixtures[0].weights.shape
+        dt_s = asked[0].dt_s
+        stamps_ns = np.repeat([frame.stamp_ns for frame in asked], [len(frame.tracks) for frame in asked])
+        self.steps_ns = stamps_ns[:, None] + np.round(dt_s * 1e9 * np.arange(1, P + 1)).astype(np.int64)  # (N, P)
+        self.track_ids = np.array([track.id for track in tracks], np.int64)
+        self.person_ids = np.concatenate([frame.person_ids for frame in asked])
+        self.paths_m = np.concatenate([prediction.paths[0].points_m for prediction in predictions]).reshape(N, P, 2)
+        self.weights = np.concatenate([mixture.weights for mixture in mixtures], dtype=float).reshape(N, P, K)
+        self.means_m = np.concatenate([mixture.means_m for mixture in mixtures], dtype=float).reshape(N, P, K, 2)
+        self.sigmas_m = np.concatenate([mixture.sigmas_m for mixture in mixtures], dtype=float).reshape(N, P, K, 2)
+        self.rhos = np.concatenate([mixture.rhos for mixture in mixtures], dtype=float).reshape(N, P, K)
+        states = np.concatenate([track.state for track in tracks]).reshape(N, 4)
+        covariances = np.concatenate([track.covariance for track in tracks]).reshape(N, 4, 4)
+        self.extrapolated = extrapolate(states, covariances, dt_s, P)
+
+    def compare(self, ids: IntArray, seen: Sequence[Positions], errors: dict[str, Errors]) -> None:
+        """Adds the errors against where `ids` (N,) were seen later; -1 is nobody."""
+        positions, known = lookup(seen, ids, self.steps_ns)
+        rows = np.flatnonzero(known & (ids >= 0))
+        if len(rows) == 0:
+            return
+        true = positions[rows]
+        paths = self.paths_m[rows]
+        nll = metrics.nll(self.weights[rows], self.means_m[rows], self.sigmas_m[rows], self.rhos[rows], true)
+        errors["predictor"].add(_errors(paths, nll, true))
+        paths, sigmas, rhos = (part[rows] for part in self.extrapolated)
+        certain = np.ones_like(rhos)[..., None]
+        nll = metrics.nll(certain, paths[:, :, None], sigmas[:, :, None], rhos[..., None], true)
+        errors["tracker"].add(_errors(paths, nll, true))
+
+
+def _errors(paths_m: FloatArray, nll: FloatArray, true_m: FloatArray) -> FloatArray:
+    """(n, P, 2), (n,), (n, P, 2) -> (n, 4) rows of ADE, FDE, MHD and NLL."""
+    columns = (metrics.ade(paths_m, true_m), metrics.fde(paths_m, true_m), metrics.mhd(paths_m, true_m), nll)
+    return np.column_stack(columns)
 
 
 def lookup(seen: Sequence[Positions], ids: IntArray, steps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
@@ -250,28 +259,6 @@ def lookup(seen: Sequence[Positions], ids: IntArray, steps_ns: IntArray) -> tupl
     fraction = (steps_ns - stamps[low]) / np.maximum(gap_ns, 1)
     start, end = positions[low, column], positions[high, column]  # (A, P, 2)
     return start + fraction[..., None] * (end - start), np.asarray((inside & (gap_ns <= MAX_GAP_NS)).all(axis=1))
-
-
-def _compare(
-    asked: _Asked,
-    ids: IntArray,
-    found: tuple[FloatArray, BoolArray],
-    errors: dict[str, Errors],
-) -> None:
-    positions, known = found
-    rows = np.flatnonzero(known & (ids >= 0))
-    if len(rows) == 0:
-        return
-    true = positions[rows]
-    weights, means, spreads, correlations = (part[rows] for part in asked.mixtures)
-    predicted_nll = metrics.nll(weights, means, spreads, correlations, true)
-    paths, sigmas, rhos = (part[rows] for part in asked.extrapolated)
-    extrapolated_nll = metrics.nll(
-        np.ones_like(rhos)[..., None], paths[:, :, None], sigmas[:, :, None], rhos[..., None], true
-    )
-    for who, path, nll in (("predictor", asked.paths_m[rows], predicted_nll), ("tracker", paths, extrapolated_nll)):
-        columns = (metrics.ade(path, true), metrics.fde(path, true), metrics.mhd(path, true), nll)
-        errors[who].add(np.column_stack(columns))
 
 
 def _track_positions(stamp_ns: int, tracks: Sequence[Track]) -> Positions:

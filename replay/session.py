@@ -8,6 +8,7 @@ from types import TracebackType
 from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
+from threadpoolctl import threadpool_limits
 
 from replay.decoders import DECODERS
 from replay.errors import LogError, Refusals
@@ -107,11 +108,13 @@ class Replay:
         return self._predictor
 
     def __enter__(self) -> Self:
+        self._one_thread = threadpool_limits(1)  # sums in BLAS depend on how many threads share them
         self._predictor = self._choice.start()
         return self
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
         self.predictor.close()
+        self._one_thread.restore_original_limits()
 
     def __iter__(self) -> Iterator[FrameResult]:
         """Yields frame results in stamp order."""

@@ -126,3 +126,17 @@ def edit_log(tmp_path):
         return path
 
     return edit
+
+
+# --- public data sets ----------------------------------------------------------------------------------------------
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    """Fails a test that skipped for want of data that is there: such a skip would hide that nothing was tested."""
+    report = yield
+    shared = Path(str(item.config.rootpath)).parent / "shared" / "data" / "dut"
+    if report.skipped and call.excinfo is not None and "PCGAN_DATA" in str(call.excinfo.value) and shared.is_dir():
+        report.outcome = "failed"
+        report.longrepr = f"skipped for want of data ({call.excinfo.value}), but {shared.name} is there"
+    return report
