@@ -31,6 +31,7 @@ class PoseBuffer:
     def __init__(self) -> None:
         self._stamps_ns: list[int] = []
         self._poses: list[VehiclePose] = []
+        self._rows: list[list[float]] = []  # position and quaternion of each, 7 numbers
 
     @property
     def latest_ns(self) -> int:
@@ -40,14 +41,16 @@ class PoseBuffer:
     def add(self, pose: VehiclePose) -> None:
         """Takes a pose; one out of order is put in its place, one of a known stamp replaces."""
         index = bisect_left(self._stamps_ns, pose.stamp_ns)
+        row = [*pose.position_m.tolist(), *pose.quaternion_xyzw.tolist()]
         if index < len(self._stamps_ns) and self._stamps_ns[index] == pose.stamp_ns:
-            self._poses[index] = pose
+            self._poses[index], self._rows[index] = pose, row
             return
         self._stamps_ns.insert(index, pose.stamp_ns)
         self._poses.insert(index, pose)
+        self._rows.insert(index, row)
         if self._stamps_ns[0] < self.latest_ns - 2 * KEEP_NS:
             old = bisect_left(self._stamps_ns, self.latest_ns - KEEP_NS)
-            del self._stamps_ns[:old], self._poses[:old]
+            del self._stamps_ns[:old], self._poses[:old], self._rows[:old]
 
     def nearest(self, stamp_ns: int) -> VehiclePose:
         """Returns the logged pose nearest in time; raises IndexError without any."""
@@ -83,12 +86,12 @@ class PoseBuffer:
             first_ns, second_ns = self._stamps_ns[pair], self._stamps_ns[pair + 1]
             known[s] = True
             extrapolated[s] = not first_ns <= stamp_ns <= second_ns
-            before.append(self._poses[pair])
-            after.append(self._poses[pair + 1])
+            before.append(self._rows[pair])
+            after.append(self._rows[pair + 1])
             fractions.append((stamp_ns - first_ns) / (second_ns - first_ns))
         poses = np.tile(np.eye(4), (S, 1, 1))
         if before:
-            poses[known] = _interpolate(before, after, np.array(fractions))
+            poses[known] = _interpolate(np.array(before), np.array(after), np.array(fractions))
         return PosesAt(poses, known, extrapolated)
 
     def _nearest_index(self, stamp_ns: int) -> int:
@@ -111,11 +114,9 @@ class PoseBuffer:
 
 
 def _interpolate(
-    before: Sequence[VehiclePose], after: Sequence[VehiclePose], fractions: NDArray[np.float64]
+    start: NDArray[np.float64], end: NDArray[np.float64], fractions: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Returns map_from_vehicle (S, 4, 4) at `fractions` of the way from one pose to the next (slerp)."""
-    start = np.array([[*pose.position_m, *pose.quaternion_xyzw] for pose in before])  # (S, 7)
-    end = np.array([[*pose.position_m, *pose.quaternion_xyzw] for pose in after])
+    """Returns map_from_vehicle (S, 4, 4) at `fractions` of the way between poses (S, 7), position and quaternion."""
     poses = np.tile(np.eye(4), (len(fractions), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(_slerp(start[:, 3:], end[:, 3:], fractions)).as_matrix()
     poses[:, :3, 3] = start[:, :3] + fractions[:, None] * (end[:, :3] - start[:, :3])
