@@ -15,7 +15,7 @@ from pcgan import metrics
 from pcgan.extrapolation import extrapolate
 from replay.frame_result import FrameResult
 from schemas.messages import BoolArray, FloatArray, GroundTruthFrame, IntArray, Prediction, Track
-from tracking.metrics import ScoredFrame, score
+from tracking.metrics import ScoredFrame, drop_ignored, score
 
 MAX_GAP_NS = 350_000_000  # a position is interpolated between measurements at most this far apart
 MATCH_M = 1.0  # a track further than this from everybody stands for nobody
@@ -103,7 +103,7 @@ class ReplayScore:
         if truth is not None:
             self._true.append(true_positions(truth))
             person_of = match(tracks, truth)
-            self._frames.append(_scored_frame(tracks, truth))
+            self._frames.append(drop_ignored(_scored_frame(tracks, truth)))
             self._scans_on.update(truth.ids[truth.lidar_points >= MIN_LIDAR_POINTS].tolist())
             self._found.update(person_of.tolist())
             usual = [not prediction.fallback for prediction in result.predictions.predictions]

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import pytest
 import torch
+from hypothesis import settings
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
@@ -16,6 +17,10 @@ from pcgan import checkpoint
 from pcgan.model import Generator, ModelConfig
 from replay.simulator import simulate
 from schemas import codec
+
+
+settings.register_profile("no deadline", deadline=None)  # a shared machine stalls now and then
+settings.load_profile("no deadline")
 
 
 class Logged(NamedTuple):

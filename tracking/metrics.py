@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from schemas.messages import BoolArray, FloatArray, IntArray
 
@@ -115,27 +117,48 @@ def similarity(distances_m: FloatArray, reach_m: float = 2.0) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class _Drive:
-    """Frames with ids as rows 0 to n - 1 and their similarities."""
+class _Pairs:
+    """The person-track pairs of one frame that are alike at all (within 2 m), E of them."""
 
-    truth: list[IntArray]
-    tracks: list[IntArray]
-    similarities: list[FloatArray]
+    truth: IntArray  # (A_f,)  people of the frame, as rows 0 to A - 1 of the drive
+    tracks: IntArray  # (B_f,)
+    rows: IntArray  # (E,)    into `truth`
+    columns: IntArray  # (E,)    into `tracks`
+    similarity: FloatArray  # (E,)
+
+    def dense(self, values: FloatArray) -> FloatArray:
+        """Returns values of the pairs as a table (A_f, B_f), 0 elsewhere."""
+        table = np.zeros((len(self.truth), len(self.tracks)))
+        table[self.rows, self.columns] = values
+        return table
+
+
+@dataclass(frozen=True, eq=False)
+class _Drive:
+    """Frames with ids as rows 0 to n - 1. Only pairs that are alike are kept: a long drive has millions of others."""
+
+    frames: list[_Pairs]
     A: int  # people in the drive
     B: int  # tracks in the drive
+    keys: IntArray  # (U,)  person * B + track of each pair that is ever alike, rising
+
+    def pair_index(self, frame: _Pairs) -> IntArray:
+        """Returns which of the drive's pairs the frame's are (E,)."""
+        return np.searchsorted(self.keys, frame.truth[frame.rows] * self.B + frame.tracks[frame.columns])
 
 
 def _prepare(frames: Iterable[ScoredFrame]) -> _Drive:
     frames = list(frames)
     people = np.unique(np.concatenate([frame.truth_ids for frame in frames] or [np.zeros(0, np.int64)]))
     tracks = np.unique(np.concatenate([frame.track_ids for frame in frames] or [np.zeros(0, np.int64)]))
-    return _Drive(
-        [np.searchsorted(people, frame.truth_ids) for frame in frames],
-        [np.searchsorted(tracks, frame.track_ids) for frame in frames],
-        [similarity(frame.distances()) for frame in frames],
-        len(people),
-        len(tracks),
-    )
+    pairs = []
+    for frame in frames:
+        sim = similarity(frame.distances())
+        rows, columns = np.nonzero(sim)
+        truth, names = np.searchsorted(people, frame.truth_ids), np.searchsorted(tracks, frame.track_ids)
+        pairs.append(_Pairs(truth, names, rows, columns, sim[rows, columns]))
+    keys = [frame.truth[frame.rows] * len(tracks) + frame.tracks[frame.columns] for frame in pairs]
+    return _Drive(pairs, len(people), len(tracks), np.unique(np.concatenate(keys or [np.zeros(0, np.int64)])))
 
 
 def hota(frames: Sequence[ScoredFrame]) -> tuple[float, float, float]:
@@ -152,25 +175,33 @@ def _hota(drive: _Drive) -> tuple[float, float, float]:
     if A == 0 or B == 0:
         value = 1.0 if A == B else 0.0
         return value, value, value
-    potential, truth_count, track_count = np.zeros((A, B)), np.zeros(A), np.zeros(B)
-    for truth, tracks, sim in zip(drive.truth, drive.tracks, drive.similarities, strict=True):
-        share = sim.sum(axis=0)[None, :] + sim.sum(axis=1)[:, None] - sim
-        potential[np.ix_(truth, tracks)] += np.divide(sim, share, out=np.zeros_like(sim), where=share > _EPS)
-        truth_count[truth] += 1
-        track_count[tracks] += 1
-    alignment = potential / (truth_count[:, None] + track_count[None, :] - potential)
+    U = len(drive.keys)
+    person, track = drive.keys // B, drive.keys % B  # (U,)
+    index = [drive.pair_index(frame) for frame in drive.frames]
+    potential, truth_count, track_count = np.zeros(U), np.zeros(A), np.zeros(B)
+    for frame, at in zip(drive.frames, index, strict=True):
+        sim = frame.similarity
+        per_person = np.bincount(frame.rows, sim, len(frame.truth))
+        per_track = np.bincount(frame.columns, sim, len(frame.tracks))
+        potential[at] += sim / (per_person[frame.rows] + per_track[frame.columns] - sim)
+        truth_count[frame.truth] += 1
+        track_count[frame.tracks] += 1
+    alignment = potential / (truth_count[person] + track_count[track] - potential)
 
-    matches = np.zeros((len(HOTA_THRESHOLDS), A, B))
+    matches = np.zeros((len(HOTA_THRESHOLDS), U))
     true_positives = np.zeros(len(HOTA_THRESHOLDS))
-    for truth, tracks, sim in zip(drive.truth, drive.tracks, drive.similarities, strict=True):
-        rows, columns = linear_sum_assignment(alignment[np.ix_(truth, tracks)] * sim, maximize=True)
-        over = sim[rows, columns] >= HOTA_THRESHOLDS[:, None] - _EPS  # (19, pairs)
-        matches[:, truth[rows], tracks[columns]] += over
+    for frame, at in zip(drive.frames, index, strict=True):
+        table = frame.dense(frame.similarity)
+        rows, columns = linear_sum_assignment(frame.dense(alignment[at] * frame.similarity), maximize=True)
+        alike = table[rows, columns] > 0
+        rows, columns = rows[alike], columns[alike]
+        over = table[rows, columns] >= HOTA_THRESHOLDS[:, None] - _EPS  # (19, pairs)
+        matches[:, np.searchsorted(drive.keys, frame.truth[rows] * B + frame.tracks[columns])] += over
         true_positives += over.sum(axis=1)
     detections = truth_count.sum() + track_count.sum()
     det_a = true_positives / np.maximum(1, detections - true_positives)
-    jaccard = matches / np.maximum(1, truth_count[:, None] + track_count[None, :] - matches)
-    ass_a = (matches * jaccard).sum(axis=(1, 2)) / np.maximum(1, true_positives)
+    jaccard = matches / np.maximum(1, truth_count[person] + track_count[track] - matches)
+    ass_a = (matches * jaccard).sum(axis=1) / np.maximum(1, true_positives)
     return float(np.sqrt(det_a * ass_a).mean()), float(det_a.mean()), float(ass_a.mean())
 
 
@@ -186,13 +217,35 @@ def _idf1(drive: _Drive, gate_m: float) -> float:
     if drive.A == 0 and drive.B == 0:
         return 1.0
     least = float(similarity(np.array(gate_m)))
-    together = np.zeros((drive.A, drive.B))
+    together = np.zeros(len(drive.keys))
     positions = 0
-    for truth, tracks, sim in zip(drive.truth, drive.tracks, drive.similarities, strict=True):
-        together[np.ix_(truth, tracks)] += sim >= least - _EPS
-        positions += len(truth) + len(tracks)
-    rows, columns = linear_sum_assignment(together, maximize=True)
-    return float(2 * together[rows, columns].sum() / positions)
+    for frame in drive.frames:
+        near = frame.similarity >= least - _EPS
+        together[drive.pair_index(frame)[near]] += 1
+        positions += len(frame.truth) + len(frame.tracks)
+    return 2 * _most_together(drive, together) / positions
+
+
+def _most_together(drive: _Drive, together: FloatArray) -> float:
+    """Returns the largest sum over pairs (U,) of which each person and each track is in one at most.
+
+    People and tracks that never met fall into groups of their own, so no table of everybody is needed.
+    """
+    met = together > 0
+    person, track = drive.keys[met] // drive.B, drive.keys[met] % drive.B
+    nodes = drive.A + drive.B
+    graph = coo_array((np.ones(len(person), bool), (person, drive.A + track)), shape=(nodes, nodes))
+    _, group = connected_components(graph, directed=False)
+    order = np.argsort(group[person], kind="stable")
+    starts = np.flatnonzero(np.diff(group[person][order], prepend=-1))
+    total = 0.0
+    for members in np.split(order, starts[1:]):
+        people, rows = np.unique(person[members], return_inverse=True)
+        tracks, columns = np.unique(track[members], return_inverse=True)
+        table = np.zeros((len(people), len(tracks)))
+        table[rows, columns] = together[met][members]
+        total += float(table[linear_sum_assignment(table, maximize=True)].sum())
+    return total
 
 
 @dataclass(frozen=True)
@@ -220,7 +273,8 @@ def _clear(drive: _Drive, gate_m: float) -> Clear:
     last_ever, last_frame = np.full(drive.A, -1), np.full(drive.A, -1)
     switches = missed = false = positions = pairs = 0
     distance = 0.0
-    for truth, tracks, sim in zip(drive.truth, drive.tracks, drive.similarities, strict=True):
+    for frame in drive.frames:
+        truth, tracks, sim = frame.truth, frame.tracks, frame.dense(frame.similarity)
         kept = last_frame[truth][:, None] == tracks[None, :]
         score = np.where(sim >= least - _EPS, 1000.0 * kept + sim, 0.0)
         rows, columns = linear_sum_assignment(score, maximize=True)
