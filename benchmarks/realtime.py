@@ -1,6 +1,6 @@
 """How fast a replay is, and whether its memory grows with the log.
 
-python -m benchmarks.realtime [--pedestrians 30] [--minutes 1 10] [--repeats 3] [--json F]
+python -m benchmarks.realtime [--pedestrians 30] [--minutes 1 10] [--repeats 3] [--without-truth] [--json F]
 
 Each replay is the command itself, in a process of its own with its predictor, on a simulated drive without --rrd.
 """
@@ -14,6 +14,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from rich.console import Console
 from rich.table import Table
 
@@ -38,6 +40,9 @@ def main() -> None:
     parser.add_argument("--pedestrians", type=int, default=30)
     parser.add_argument("--minutes", type=float, nargs="+", default=[1.0])
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument(
+        "--without-truth", action="store_true", help="as a real drive: no ground truth, so no scores of the whole drive"
+    )
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     rows = []
@@ -46,10 +51,29 @@ def main() -> None:
         for minutes in arguments.minutes:
             log = folder / "drive.mcap"
             simulate(log, clip=None, vehicle=None, pedestrians=arguments.pedestrians, duration_s=60 * minutes, seed=1)
+            if arguments.without_truth:
+                log = drop_truth(log, folder / "recorded.mcap")
             rows += [{"minutes": minutes, **measure(log, folder)} for _ in range(arguments.repeats)]
     show(rows)
     if arguments.json:
         arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+def drop_truth(log: Path, output: Path) -> Path:
+    """Copies a drive without its ground truth."""
+    with log.open("rb") as stream, output.open("wb") as copy:
+        writer = Writer(copy)
+        writer.start()
+        channels: dict[int, int] = {}
+        for schema, channel, message in make_reader(stream).iter_messages():
+            if channel.topic == "/simulation/ground_truth" or schema is None:
+                continue
+            if channel.id not in channels:
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, schema_id)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return output
 
 
 def measure(log: Path, folder: Path) -> dict[str, Any]:

@@ -18,7 +18,6 @@ from pcgan.model import Generator, ModelConfig
 from replay.simulator import simulate
 from schemas import codec
 
-
 settings.register_profile("no deadline", deadline=None)  # a shared machine stalls now and then
 settings.load_profile("no deadline")
 
