@@ -51,8 +51,14 @@ def sha256(path: Path) -> str:
 
 def save(path: Path, config: ModelConfig, tensors: Mapping[str, Tensor], training: Mapping[str, Any]) -> None:
     """Writes a checkpoint; an existing file is replaced only once the new one is complete."""
-    header = {"format": FORMAT_VERSION, "name": path.stem, "config": asdict(config), "training": dict(training)}
     contiguous = {name: tensor.detach().contiguous().clone() for name, tensor in sorted(tensors.items())}
+    header = {
+        "format": FORMAT_VERSION,
+        "name": path.stem,
+        "config": asdict(config),
+        "training": dict(training),
+        "tensors_sha256": _digest(contiguous),
+    }
     data = safetensors.torch.save(contiguous, metadata={"pcgan": json.dumps(header, sort_keys=True)})
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.part")
@@ -86,10 +92,20 @@ def load(path: Path) -> Checkpoint:
         raise CheckpointError(f"{path} is of checkpoint format {version}; this version reads {FORMAT_VERSION}")
     try:
         config = ModelConfig.from_dict(header["config"])
-        name, training = str(header["name"]), dict(header["training"])
+        name, training, digest = str(header["name"]), dict(header["training"]), header["tensors_sha256"]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(f"{path}: {error}") from error
+    if digest != _digest(tensors):
+        raise CheckpointError(f"{path} is corrupt: its weights are not those that were saved")
     return Checkpoint(name, config, training, tensors)
+
+
+def _digest(tensors: Mapping[str, Tensor]) -> str:
+    """Returns the SHA-256 of named tensors, in hex; safetensors itself has no checksum."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        digest.update(name.encode() + tensor.detach().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def load_generator(path: Path) -> tuple[Generator, Checkpoint]:

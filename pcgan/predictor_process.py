@@ -73,6 +73,7 @@ def serve(
     Malformed and oversize payloads are refused, logged and counted; the count is returned.
     """
     refused = 0
+    served: bytes | None = None  # whose frame was answered last
     publisher = session.declare_publisher(
         topics.zenoh_key(topics.PREDICTIONS, namespace),
         encoding=ENCODING.with_schema(codec.schema_name(PredictionFrame)),
@@ -89,8 +90,16 @@ def serve(
                 refused += 1
                 log.warning("refused a message on %s: %s", sample.key_expr, error)
                 continue
-            answer = codec.encode(predictor.step(frame))
-            _wait_for_match(publisher)  # what is put before anybody listens is lost
+            try:
+                answer = codec.encode(predictor.step(frame))
+            except Exception:  # a stranger's frame must not end the service for everybody else
+                refused += 1
+                log.exception("could not answer frame %d on %s", frame.sequence, sample.key_expr)
+                continue
+            run = sample.attachment.to_bytes() if sample.attachment is not None else b""
+            if run != served:  # somebody new asks: what is put before zenoh knows of him is lost
+                _wait_for_match(publisher)
+                served = run
             publisher.put(answer, attachment=sample.attachment)
         token.undeclare()  # type: ignore[no-untyped-call]
     publisher.undeclare()  # type: ignore[no-untyped-call]

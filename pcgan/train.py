@@ -95,7 +95,8 @@ def train(config: TrainConfig, data: TrainData | None = None, console: Console |
         epoch, step = _restore(state_path, config, model, optimiser, average)
     total = config.epochs * sum(1 for _ in batches(data.training, config.batch_pedestrians))
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=console or Console(stderr=True)) as progress:
+    console = console or Console(stderr=True)
+    with Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("training", total=total, completed=step)
         try:
             while epoch < config.epochs:

@@ -121,7 +121,11 @@ def replay(
     if rrd and view:
         _fail("--rrd and --view exclude each other: write the recording and open it with rerun, or watch now")
     output = output or logs[0].with_name(f"{logs[0].stem}.pcgan.mcap")
-    refuse_overwriting(logs, *(path for path in (rrd, picture, summary) if path is not None))
+    extras = [path for path in (rrd, picture, summary) if path is not None]
+    refuse_overwriting(logs, *extras)
+    for path in extras:  # now, not after an hour of replay
+        if not path.parent.is_dir() or path.is_dir():
+            _fail(f"{path} cannot be written: {path.parent} is no folder, or {path.name} is one")
     given = {"start_s": start or None, "duration_s": duration, "topics": _remaps(topic) or None}
     settings = _settings(settings_file).model_copy(update={k: v for k, v in given.items() if v is not None})
     choice = PredictorChoice(predictor.value, model, connect, zenoh_config, namespace)
@@ -140,7 +144,10 @@ def replay(
             if picture is not None:
                 busiest.offer(result)
 
-        done = record(run, output, shown, merge=merge, on_frame=on_frame)
+        try:
+            done = record(run, output, shown, merge=merge, on_frame=on_frame)
+        except Interrupted as interruption:  # before the first frame: there is nothing to close
+            raise typer.Exit(128 + interruption.signum) from None
     written = [output]
     if picture is not None and busiest.result is not None:
         draw_top_down(busiest.result, picture)

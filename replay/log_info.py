@@ -14,6 +14,7 @@ from replay.decoders import DECODERS
 from replay.errors import LogError
 from replay.log_reader import ChannelInfo, LogReader, RawMessage
 from replay.roles import assign_roles
+from replay.session import Replay, ReplaySettings
 from schemas import topics
 from schemas.codec import CodecError
 
@@ -29,7 +30,8 @@ def describe_log(
     reader = LogReader(paths, salvage=salvage)
     try:
         roles = assign_roles(reader.channels, remaps)
-        problem, role_of, missing = None, _role_names(roles.topic_of), list(roles.missing)
+        role_of, missing = _role_names(roles.topic_of), list(roles.missing)
+        problem = _refused(paths, remaps, salvage=salvage)
     except LogError as error:
         problem, role_of, missing = str(error), {}, []
     timings = _timings(reader, seconds)
@@ -45,6 +47,15 @@ def describe_log(
         "salvage_losses": reader.losses.notes,
         "topics": [_topic(channel, duration_s, role_of, timings, scans) for channel in reader.channels],
     }
+
+
+def _refused(paths: Sequence[Path], remaps: Mapping[str, str] | None, *, salvage: bool) -> str | None:
+    """Returns why a replay would refuse the log, or None."""
+    try:
+        Replay(paths, ReplaySettings(topics=dict(remaps or {})), salvage=salvage)
+    except LogError as error:
+        return str(error)
+    return None
 
 
 def print_info(description: dict[str, Any], console: Console) -> None:

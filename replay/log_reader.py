@@ -3,10 +3,12 @@
 Memory is bounded by the chunks that overlap in time, whatever the length of the log. Files are opened for reading only.
 """
 
+import contextlib
 import errno
 import hashlib
 import heapq
 import io
+import mmap
 import struct
 import zlib
 from bisect import bisect_left
@@ -16,14 +18,14 @@ from dataclasses import dataclass, field
 from itertools import zip_longest
 from operator import attrgetter
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, NamedTuple, cast
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema, Statistics
-from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
+from mcap.stream_reader import MAGIC_SIZE, breakup_chunk, get_chunk_data_stream
 
 from replay.errors import LogError
 
@@ -195,6 +197,14 @@ class _SalvagedFile:
         self._channels: dict[int, Channel] = {}
         counts: Counter[int] = Counter()
         recorded = 0
+        if path.stat().st_size == 0:
+            losses.notes.append(f"{path.name}: the file is empty")
+        else:
+            with path.open("rb") as stream, contextlib.suppress(OSError):  # a seek before the beginning
+                try:
+                    _check_summary_crc(stream)
+                except ValueError as error:
+                    losses.notes.append(f"{path.name}: {error}")
         self.start_ns, self.end_ns = 2**63, 0
         for record in self._records(losses):
             if isinstance(record, Schema):
@@ -235,40 +245,92 @@ class _SalvagedFile:
         return _reordered(raw)
 
     def _records(self, losses: Losses) -> Iterator[McapRecord]:
-        """Yields the records of every intact chunk, in file order, up to where the file stops making sense."""
-        with self._path.open("rb") as stream:
-            yield from self._intact(stream, losses)
+        """Yields the records of every intact chunk, in file order; looks for the next one behind what is damaged."""
+        if self._path.stat().st_size == 0:
+            return
+        with self._path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as view:
+            last = MAGIC_SIZE
+            at: int | None = last
+            while at is not None and at + _RECORD.size <= len(view):
+                opcode, length = _RECORD.unpack_from(view, at)
+                if opcode == Opcode.FOOTER and at + _RECORD.size + _FOOTER_END.size <= len(view):
+                    return
+                try:
+                    if opcode == Opcode.CHUNK:
+                        inside, end = _read_chunk(view, at)
+                        yield from inside
+                    else:
+                        record, end = _read_record(view, at)
+                        if record is not None:
+                            yield record
+                except Exception as error:  # what mcap raises on damage has no common base
+                    losses.chunks += opcode == Opcode.CHUNK
+                    what = "chunk" if opcode == Opcode.CHUNK else "record"
+                    losses.notes.append(
+                        f"{self._path.name}: {what} at byte {at} is damaged ({_described(self._path, error)})"
+                    )
+                    end = at + _RECORD.size + length
+                    last, at = at, end if _plausible(view, end) else _find_chunk(view, at + 1)
+                else:
+                    last = at = end
+            losses.notes.append(f"{self._path.name}: nothing readable after byte {last}")
 
-    def _intact(self, stream: io.BufferedReader, losses: Losses) -> Iterator[McapRecord]:
-        records = StreamReader(stream, emit_chunks=True, record_size_limit=self._path.stat().st_size).records
-        while True:
-            offset = stream.tell()
-            try:
-                record = next(records, None)
-            except Exception as error:  # what mcap raises on damage has no common base
-                losses.notes.append(
-                    f"{self._path.name}: nothing readable after byte {offset} ({_described(self._path, error)})"
-                )
-                return
-            if record is None:
-                return
-            if not isinstance(record, Chunk):
-                yield record
-                continue
-            try:
-                inside = breakup_chunk(record, validate_crc=True)
-            except Exception as error:
-                losses.chunks += 1
-                losses.notes.append(
-                    f"{self._path.name}: chunk at byte {offset} is damaged ({_described(self._path, error)})"
-                )
-                continue
-            yield from inside
+
+def _read_chunk(view: mmap.mmap, at: int) -> tuple[list[McapRecord], int]:
+    """Returns the records in the chunk at an offset and where it ends; raises if it is not what was written."""
+    view.seek(at + _RECORD.size)
+    chunk = Chunk.read(ReadDataStream(cast(IO[bytes], view)))  # by its own length: the record's may be damaged
+    if chunk.uncompressed_size > max(1 << 26, 1000 * len(chunk.data)):
+        raise ValueError(f"it claims to hold {chunk.uncompressed_size} bytes")
+    return breakup_chunk(chunk, validate_crc=True), view.tell()
+
+
+def _read_record(view: mmap.mmap, at: int) -> tuple[McapRecord | None, int]:
+    """Returns the record at an offset, None if it is of a kind not needed here, and where it ends."""
+    if not _plausible(view, at):
+        raise ValueError("its header makes no sense")
+    opcode, length = _RECORD.unpack_from(view, at)
+    view.seek(at + _RECORD.size)
+    stream, end = ReadDataStream(cast(IO[bytes], view)), at + _RECORD.size + length
+    match opcode:
+        case Opcode.SCHEMA:
+            return Schema.read(stream), end
+        case Opcode.CHANNEL:
+            return Channel.read(stream), end
+        case Opcode.MESSAGE:
+            return Message.read(stream, length), end
+        case Opcode.STATISTICS:
+            return Statistics.read(stream), end
+    return None, end
+
+
+def _plausible(view: mmap.mmap, at: int) -> bool:
+    """Tells whether a record may begin at an offset."""
+    if at + _RECORD.size > len(view):
+        return False
+    opcode, length = _RECORD.unpack_from(view, at)
+    known = 1 <= opcode <= max(Opcode) or opcode >= 0x80  # the upper half is anybody's own
+    return bool(known and length <= len(view) - at - _RECORD.size)
+
+
+def _find_chunk(view: mmap.mmap, start: int) -> int | None:
+    """Returns where the next chunk seems to begin: an opcode, a length that fits, a compression that exists."""
+    at = start
+    while (at := view.find(bytes([Opcode.CHUNK]), at)) != -1:
+        name_at = at + _RECORD.size + _CHUNK_HEAD_BYTES
+        named = view[name_at : name_at + 8]
+        if _plausible(view, at) and named.startswith(_COMPRESSIONS):
+            return at
+        at += 1
+    return None
 
 
 _RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 _FOOTER_END = struct.Struct("<QQI8s")  # summary start, summary offset start, CRC; then the magic that ends a file
+_CHUNK_HEAD_BYTES = 8 + 8 + 8 + 4  # start, end, uncompressed size, CRC, before the name of the compression
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time, before the data
+_MAGIC = b"\x89MCAP0\r\n"
+_COMPRESSIONS = tuple(struct.pack("<I", len(name)) + name for name in (b"zstd", b"lz4", b""))
 _log_time = attrgetter("log_time_ns")
 _HINT = "; try --salvage"
 
@@ -294,7 +356,9 @@ def _check_summary_crc(stream: IO[bytes]) -> None:
     The CRC is the footer's last field, and covers all from the beginning of the summary up to itself.
     """
     stream.seek(-_FOOTER_END.size, io.SEEK_END)
-    summary_start, _, crc, _ = _FOOTER_END.unpack(stream.read(_FOOTER_END.size))
+    summary_start, _, crc, magic = _FOOTER_END.unpack(stream.read(_FOOTER_END.size))
+    if magic != _MAGIC:
+        raise ValueError("it does not end as an MCAP file does")
     if summary_start and crc:
         end = stream.seek(0, io.SEEK_END) - _FOOTER_END.size + 16  # the two offsets before the CRC are covered, too
         stream.seek(summary_start)

@@ -33,7 +33,7 @@ class FrameTracker:
         """Tracks one frame; unpublished ones, which warm the tracker up, have no sequence of their own."""
         sensors = frame.sensors
         if frame.epoch != self._epoch:
-            self._stage = TrackingStage(self._settings)
+            self._stage = TrackingStage(self._settings, first_id=self._stage.next_id)  # no id ever means two people
             self._vehicle.clear()
             self._epoch = frame.epoch
         self._vehicle.append((sensors.stamp_ns, frame.vehicle_state))
@@ -83,6 +83,8 @@ def run_pipeline(
             continue
         with clock.measure("track"):
             measurements, tracks = tracker.step(frame, published=published(frame))
+        for _ in range(measurements.refused):
+            refusals.add("lidar clusters", frame.sensors.stamp_ns, "cluster out of reach, or of an impossible shape")
         if not published(frame):
             continue
         predictor.ask(tracks, vehicle_pose(frame.sensors, tracks))

@@ -83,6 +83,10 @@ class InlinePredictor:
         """Does nothing."""
 
 
+class StartError(PredictorError):
+    """A spawned predictor died before it served."""
+
+
 class Child:
     """A predictor process of our own, in its own process session so that Ctrl-C does not reach it."""
 
@@ -285,10 +289,14 @@ class RemotePredictor:
             self._child.stop(patience_s=0)
             self._alive.clear()
             self._start_child()
-        self._wait_until_ready()
+        try:
+            self._wait_until_ready()
+        except StartError as error:  # one that dies while it starts is one failure more, not the end
+            return self._replace(str(error))
         for sequence, payload in self._unanswered.items():
             if sequence not in self._answers:
                 self._publisher.put(payload, attachment=self._run)
+        return None
 
     def _start_child(self) -> None:
         assert self._child_arguments is not None
@@ -305,7 +313,7 @@ class RemotePredictor:
             if self._alive and _matched(self._publisher):
                 break
             if self._child is not None and (ending := self._child.died()) is not None:
-                raise PredictorError(f"the predictor did not start ({ending})")
+                raise StartError(f"the predictor did not start ({ending})")
             if time.monotonic() > deadline:
                 raise PredictorError(
                     f"no predictor was ready within {self._startup_s:g} s; start one with: pcgan predict"

@@ -19,8 +19,10 @@ from replay.pipeline import FrameTracker, run_pipeline
 from replay.remote_predictor import AskedPredictor, InlinePredictor, RemotePredictor
 from replay.roles import assign_roles
 from replay.stage_clock import StageClock
-from replay.time_sync import SyncedFrame, SyncSettings, TimeSync
+from replay.time_sync import DEFAULT_VEHICLE_FRAME, SyncedFrame, SyncSettings, TimeSync
+from replay.transform_tree import TransformTree
 from schemas.codec import CodecError
+from schemas.messages import LidarClusters, Transform, VehiclePose
 from tracking.pipeline import TrackingSettings
 
 WARM_UP_NS = 4_000_000_000  # what the tracker sees, unpublished, before --start
@@ -94,11 +96,36 @@ class Replay:
         if self.start_ns >= self.end_ns:
             length_s = (self.reader.end_ns - self.reader.start_ns) / 1e9
             raise LogError(f"nothing to replay from {self.settings.start_s:g} s: the log lasts {length_s:.1f} s")
+        self._check_mounts()
         self._choice = predictor or PredictorChoice()
         self._images = images
         self._window = window
         self._pacer = Pacer(rate)
         self._predictor: AskedPredictor | None = None
+
+    def _check_mounts(self) -> None:
+        """Raises LogError unless the transforms at the log's beginning say where the LiDAR is on the vehicle."""
+        tree = TransformTree()
+        frames: dict[str, str] = {}
+        for message in self._static_messages():
+            for decoded in _decoded(message, Refusals()):
+                if isinstance(decoded, Transform):
+                    tree.add(decoded)
+        wanted = {self.roles.topic_of[name] for name in ("/velodyne/front/clusters", "/vn100/odometry")}
+        for message in self.reader.messages(wanted):
+            for decoded in _decoded(message, Refusals()):
+                if isinstance(decoded, LidarClusters):
+                    frames.setdefault("lidar", decoded.frame_id)
+                elif isinstance(decoded, VehiclePose):
+                    frames.setdefault("vehicle", decoded.child_frame_id or DEFAULT_VEHICLE_FRAME)
+            if len(frames) == 2:
+                if tree.transform(frames["vehicle"], frames["lidar"]) is None:
+                    known = ", ".join(tree.frames) or "none"
+                    raise LogError(
+                        f"no transform joins {frames['vehicle']!r} and {frames['lidar']!r}; "
+                        f"the frames of /tf_static and /tf are {known}"
+                    )
+                return
 
     @property
     def predictor(self) -> AskedPredictor:
@@ -109,7 +136,11 @@ class Replay:
 
     def __enter__(self) -> Self:
         self._one_thread = threadpool_limits(1)  # sums in BLAS depend on how many threads share them
-        self._predictor = self._choice.start()
+        try:
+            self._predictor = self._choice.start()
+        except BaseException:
+            self._one_thread.restore_original_limits()
+            raise
         return self
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
@@ -131,11 +162,7 @@ class Replay:
     def frames(self) -> Iterator[SyncedFrame]:
         """Yields synchronised frames from 4 s before the start on."""
         sync = TimeSync(self.roles.cameras, self.settings.sync, self.refusals)
-        names = self.roles.default_of
-        if "/tf_static" in self.roles.topic_of:
-            names.pop(self.roles.topic_of.get("/tf", ""), None)  # mounts are static; the pose has a topic of its own
-        if not self._images:
-            names = {name: default for name, default in names.items() if not default.endswith("/image")}
+        names = self._names(images=self._images)
         cameras = {name: _camera_of(default) for name, default in names.items()}
         from_ns = max(self.reader.start_ns, self.start_ns - WARM_UP_NS)
         for message in self._static_messages():
@@ -160,12 +187,19 @@ class Replay:
             self._pacer.wait_for(frame.log_time_ns)
             yield frame
 
+    def _names(self, *, images: bool = False) -> dict[str, str]:
+        """Returns the topics to read: name in this log -> default name."""
+        names = self.roles.default_of
+        if "/tf_static" in self.roles.topic_of:
+            names.pop(self.roles.topic_of.get("/tf", ""), None)  # mounts are static; the pose has a topic of its own
+        return {name: default for name, default in names.items() if images or not default.endswith("/image")}
+
     def _static_messages(self) -> Iterator[RawMessage]:
         """Yields calibrations and transforms from the log's beginning: they may occur there only, once."""
         wanted = {
             name
-            for default, name in self.roles.topic_of.items()
-            if default.endswith("/camera_info") or default == "/tf_static"
+            for name, default in self._names().items()
+            if default.endswith("/camera_info") or default in ("/tf_static", "/tf")
         }
         if wanted:
             end_ns = self.reader.start_ns + STATIC_SEARCH_NS

@@ -66,6 +66,7 @@ def decode(message_type: type[T], data: bytes) -> T:
         message = protobuf_type.FromString(data)
     except DecodeError as error:
         raise CodecError(f"not a {PACKAGE}.{message_type.__name__}: {error}") from error
+    message.DiscardUnknownFields()  # a newer sender's; they would stand between the fields read below
     decoded: T = decoder(message)
     _remember(decoded, data)
     return decoded
@@ -152,12 +153,20 @@ def _columns(message: Message, *names: str) -> NDArray[np.float64]:
     return rows.T
 
 
+# Nothing measured in metres, seconds or pixels is larger; what is would overflow somewhere downstream.
+LARGEST = 1e9
+
+
 def _check_finite(rows: NDArray[Any], descriptor: Descriptor, names: Sequence[str]) -> None:
-    """Raises CodecError naming the first of the rows that holds NaN or infinity."""
-    if not math.isfinite(rows.sum(dtype=float)):  # one pass; no sum of finite float32s or coordinates overflows
+    """Raises CodecError naming the first of the rows that holds NaN, infinity or an absurdly large number."""
+    if rows.size == 0 or rows.dtype.kind != "f":
+        return
+    if not (rows.min() >= -LARGEST and rows.max() <= LARGEST):  # NaN fails every comparison
         for name, row in zip(names, rows, strict=True):
             if not np.isfinite(row).all():
                 raise CodecError(f"{descriptor.name}.{name} holds NaN or infinity")
+            if len(row) and np.abs(row).max() > LARGEST:
+                raise CodecError(f"{descriptor.name}.{name} holds {np.abs(row).max():.3g}, more than {LARGEST:g}")
 
 
 def _table(
@@ -225,10 +234,11 @@ def _require(condition: bool, message: Message, problem: str) -> None:
 
 
 def _check_scalars(message: Message, *names: str) -> None:
-    values = [getattr(message, name) for name in names]
-    if not math.isfinite(sum(values)):
-        for name, value in zip(names, values, strict=True):
-            _require(math.isfinite(value), message, f"{name} is not finite")
+    for name in names:
+        value = getattr(message, name)
+        if not -LARGEST <= value <= LARGEST:
+            problem = f"is {value:.3g}, more than {LARGEST:g}" if math.isfinite(value) else "is not finite"
+            raise CodecError(f"{message.DESCRIPTOR.name}.{name} {problem}")
 
 
 def _check_stamp(message: Message) -> None:
@@ -365,9 +375,7 @@ def _decode_track_frame(message: pb.TrackFrame) -> TrackFrame:
 
 def _decode_tracks(tracks: Sequence[pb.Track]) -> tuple[Track, ...]:
     present = np.array([(track.x, track.y, track.vx, track.vy, track.existence) for track in tracks])
-    if not np.isfinite(present).all():
-        bad = int(np.flatnonzero(~np.isfinite(present).all(axis=0))[0])
-        raise CodecError(f"Track.{('x', 'y', 'vx', 'vy', 'existence')[bad]} is not finite")
+    _check_finite(present.T, pb.Track.DESCRIPTOR, ("x", "y", "vx", "vy", "existence"))
     outside = np.flatnonzero((present[:, 4] < 0) | (present[:, 4] > 1))
     _require(len(outside) == 0, tracks[0], f"existence {present[outside[:1], 4]} is outside 0 to 1")
     wires = [_packed_fields(track.SerializeToString()) for track in tracks]

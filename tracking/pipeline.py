@@ -33,9 +33,14 @@ class TrackingResult:
 class TrackingStage:
     """Fusion and the tracker in a row; the tracker's prediction goes into fusion as data."""
 
-    def __init__(self, settings: TrackingSettings | None = None) -> None:
+    def __init__(self, settings: TrackingSettings | None = None, first_id: int = 1) -> None:
         self.settings = TrackingSettings() if settings is None else settings
-        self._tracker = Tracker(self.settings.tracker)
+        self._tracker = Tracker(self.settings.tracker, first_id)
+
+    @property
+    def next_id(self) -> int:
+        """The number that the next published track will get: where a stage after this one goes on."""
+        return self._tracker.next_id
 
     def step(self, frame: SensorFrame) -> TrackingResult:
         """Returns the frame's measurements and the tracks after them.

@@ -232,11 +232,16 @@ class _Scan:
 class Tracker:
     """Holds the last few states and the numbers given to published tracks, and nothing else."""
 
-    def __init__(self, params: TrackerParams | None = None) -> None:
+    def __init__(self, params: TrackerParams | None = None, first_id: int = 1) -> None:
         self.params = TrackerParams() if params is None else params
         self._ring: deque[_Scan] = deque(maxlen=self.params.ring)
         self._ids: dict[tuple[int, int], int] = {}  # (born_ns, born_index) -> published id
-        self._next_id = 1
+        self._next_id = first_id
+
+    @property
+    def next_id(self) -> int:
+        """The number that the next published track will get."""
+        return self._next_id
 
     @property
     def state(self) -> TrackerState | None:

@@ -24,10 +24,11 @@ def saved(tmp_path, make_generator):
 def rewrite(path, change_header=None, change_tensors=None):
     header = {"format": 1, "name": "x", "config": asdict(ModelConfig(dt_s=0.4)), "training": {}}
     tensors = safetensors.torch.load_file(path)
-    if change_header:
-        change_header(header)
     if change_tensors:
         change_tensors(tensors)
+    header["tensors_sha256"] = checkpoint._digest(tensors)
+    if change_header:
+        change_header(header)
     safetensors.torch.save_file(tensors, path, metadata={"pcgan": json.dumps(header)})
 
 
@@ -95,6 +96,16 @@ def test_header_that_differs_is_refused(saved, change, problem):
     path, _ = saved
     rewrite(path, change)
     with pytest.raises(CheckpointError, match=problem):
+        checkpoint.load_generator(path)
+
+
+@pytest.mark.parametrize("place", [0.5, 0.9, 0.999])
+def test_a_flipped_bit_in_the_weights_is_refused(saved, place):
+    path, _ = saved
+    data = bytearray(path.read_bytes())
+    data[int(len(data) * place)] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(CheckpointError, match=r"small\.safetensors is corrupt: its weights are not those"):
         checkpoint.load_generator(path)
 
 

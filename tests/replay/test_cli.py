@@ -212,8 +212,8 @@ def test_what_cannot_be_written_beside_the_output_is_one_line(inline, short_driv
         short_drive, "-o", tmp_path / "out.mcap", "--duration", "0.5", option, tmp_path / "no" / "file.png"
     )
     assert outcome.code == 2
-    assert "file.png" in one_line(outcome.err)
-    assert (tmp_path / "out.mcap").is_file()
+    assert "file.png cannot be written" in one_line(outcome.err)
+    assert list(tmp_path.iterdir()) == []  # said before the replay, not after
 
 
 # --- the recording is never touched ----------------------------------------------------------------------------------

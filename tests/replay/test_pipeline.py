@@ -130,6 +130,19 @@ def test_a_new_epoch_begins_with_a_new_tracker(frames):
     assert [r.tracks.sequence for r in results] == list(range(30))  # goes on: answers are told apart by it
     assert results[14].tracks.tracks
     assert results[-1].tracks.tracks
+    before, after = ({t.id for r in part for t in r.tracks.tracks} for part in (results[:15], results[15:]))
+    assert max(before) < min(after)  # no id ever means two people
+
+
+def test_clusters_that_fusion_drops_are_counted(frames):
+    given = [frames(i) for i in range(6)]
+    clusters = given[3].sensors.clusters
+    far = replace(clusters, centroids_m=np.where(np.arange(3) == 0, 2e4, clusters.centroids_m))
+    given[3] = replace(given[3], sensors=replace(given[3].sensors, clusters=far))
+    refusals = Refusals()
+    assert len(list(run_pipeline(given, tracker(), Echo(), refusals=refusals))) == 6
+    assert refusals.total == len(clusters.points) > 0
+    assert "cluster out of reach" in refusals.first[0]
 
 
 def test_a_late_scan_gives_no_frame_but_is_taken_in(frames):

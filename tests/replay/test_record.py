@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections import Counter
 from contextlib import suppress
 from pathlib import Path
@@ -188,6 +189,29 @@ def test_a_predictor_killed_three_times_changes_nothing(short_drive, model, reco
     assert len(killed) == 3
     assert summary.as_json()["predictor_restarts"] >= 3
     assert summary.complete
+    assert (tmp_path / "out.mcap").read_bytes() == recorded.path.read_bytes()
+
+
+def test_a_predictor_killed_again_while_it_starts_changes_nothing(short_drive, model, recorded, tmp_path):
+    replaying = run(short_drive, model, "spawned", window=4)
+    killers = []
+
+    def kill_the_next(old):
+        while (new := replaying.predictor.pid) == old:
+            time.sleep(0.001)
+        os.kill(new, signal.SIGKILL)  # milliseconds old: Python has not even started
+
+    def kill(frame):
+        if frame.tracks.sequence == 5:
+            old = replaying.predictor.pid
+            killers.append(threading.Thread(target=kill_the_next, args=(old,)))
+            killers[0].start()
+            os.kill(old, signal.SIGKILL)
+
+    summary = record(replaying, tmp_path / "out.mcap", on_frame=kill)
+    killers[0].join(10)
+    assert summary.stopped is None
+    assert summary.as_json()["predictor_restarts"] == 2
     assert (tmp_path / "out.mcap").read_bytes() == recorded.path.read_bytes()
 
 
