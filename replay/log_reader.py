@@ -257,10 +257,10 @@ class _SalvagedFile:
                     return
                 try:
                     if opcode == Opcode.CHUNK:
-                        inside, end = _read_chunk(view, at)
+                        inside, following = _read_chunk(view, at)
                         yield from inside
                     else:
-                        record, end = _read_record(view, at)
+                        record, following = _read_record(view, at)
                         if record is not None:
                             yield record
                 except Exception as error:  # what mcap raises on damage has no common base
@@ -270,19 +270,22 @@ class _SalvagedFile:
                         f"{self._path.name}: {what} at byte {at} is damaged ({_described(self._path, error)})"
                     )
                     end = at + _RECORD.size + length
-                    last, at = at, end if _plausible(view, end) else _find_chunk(view, at + 1)
-                else:
-                    last = at = end
+                    following = end if _plausible(view, end) else _find_chunk(view, at + 1)
+                last, at = following or at, following
             losses.notes.append(f"{self._path.name}: nothing readable after byte {last}")
 
 
-def _read_chunk(view: mmap.mmap, at: int) -> tuple[list[McapRecord], int]:
-    """Returns the records in the chunk at an offset and where it ends; raises if it is not what was written."""
+def _read_chunk(view: mmap.mmap, at: int) -> tuple[list[McapRecord], int | None]:
+    """Returns the records in the chunk at an offset and where to read on; raises if it is not what was written."""
     view.seek(at + _RECORD.size)
     chunk = Chunk.read(ReadDataStream(cast(IO[bytes], view)))  # by its own length: the record's may be damaged
     if chunk.uncompressed_size > max(1 << 26, 1000 * len(chunk.data)):
         raise ValueError(f"it claims to hold {chunk.uncompressed_size} bytes")
-    return breakup_chunk(chunk, validate_crc=True), view.tell()
+    inside, end = breakup_chunk(chunk, validate_crc=True), view.tell()
+    _, length = _RECORD.unpack_from(view, at)
+    if end != at + _RECORD.size + length:  # one of the two lengths is wrong, though the content is not
+        return inside, _find_chunk(view, at + 1)
+    return inside, end
 
 
 def _read_record(view: mmap.mmap, at: int) -> tuple[McapRecord | None, int]:

@@ -320,6 +320,25 @@ def test_a_flipped_byte_anywhere_never_invents_a_message(make_log, records, kind
     assert salvage or named > 0.5 * len(places)
 
 
+@pytest.mark.parametrize("kind", ["indexed", "zstd", "lz4"])
+def test_salvage_loses_no_more_than_the_chunk_that_is_damaged(make_log, records, kind):
+    """One wrong byte anywhere, record headers and lengths included: every other chunk's messages are read."""
+    path = make_log(records, **KINDS[kind])
+    original = path.read_bytes()
+    chunks = {}
+    for index in chunk_indexes(path):
+        end = index.chunk_start_offset + index.chunk_length
+        chunks[index.chunk_start_offset, end] = intact(original[:end]) - intact(original[: index.chunk_start_offset])
+    assert len(chunks) > 3
+    assert sum(chunks.values(), Counter()) == Counter(record.message for record in records)
+    for place in sorted({*range(8, len(original), 11), *opcodes(original)}):
+        data = bytearray(original)
+        data[place] ^= 0x55
+        path.write_bytes(data)
+        elsewhere = sum((inside for (start, end), inside in chunks.items() if not start <= place < end), Counter())
+        assert not elsewhere - Counter(payloads(LogReader([path], salvage=True))), f"byte {place}"
+
+
 def test_a_zeroed_tail(make_log, records):
     path = make_log(records, **KINDS["indexed"])
     data = path.read_bytes()
