@@ -96,6 +96,7 @@ class Replay:
         if self.start_ns >= self.end_ns:
             length_s = (self.reader.end_ns - self.reader.start_ns) / 1e9
             raise LogError(f"nothing to replay from {self.settings.start_s:g} s: the log lasts {length_s:.1f} s")
+        self._static = self._read_static()
         self._check_mounts()
         self._choice = predictor or PredictorChoice()
         self._images = images
@@ -107,7 +108,7 @@ class Replay:
         """Raises LogError unless the transforms at the log's beginning say where the LiDAR is on the vehicle."""
         tree = TransformTree()
         frames: dict[str, str] = {}
-        for message in self._static_messages():
+        for message in self._static:
             for decoded in _decoded(message, Refusals()):
                 if isinstance(decoded, Transform):
                     tree.add(decoded)
@@ -165,7 +166,7 @@ class Replay:
         names = self._names(images=self._images)
         cameras = {name: _camera_of(default) for name, default in names.items()}
         from_ns = max(self.reader.start_ns, self.start_ns - WARM_UP_NS)
-        for message in self._static_messages():
+        for message in self._static:
             # what the stream below comes to again is counted there
             refusals = self.refusals if message.log_time_ns < from_ns - LEAD_IN_NS else Refusals()
             for decoded in _decoded(message, refusals):
@@ -194,16 +195,16 @@ class Replay:
             names.pop(self.roles.topic_of.get("/tf", ""), None)  # mounts are static; the pose has a topic of its own
         return {name: default for name, default in names.items() if images or not default.endswith("/image")}
 
-    def _static_messages(self) -> Iterator[RawMessage]:
-        """Yields calibrations and transforms from the log's beginning: they may occur there only, once."""
+    def _read_static(self) -> list[RawMessage]:
+        """Returns calibrations and transforms from the log's beginning: they may occur there only, once."""
         wanted = {
             name
             for name, default in self._names().items()
             if default.endswith("/camera_info") or default in ("/tf_static", "/tf")
         }
-        if wanted:
-            end_ns = self.reader.start_ns + STATIC_SEARCH_NS
-            yield from self.reader.messages(wanted, None, end_ns)
+        if not wanted:
+            return []
+        return list(self.reader.messages(wanted, None, self.reader.start_ns + STATIC_SEARCH_NS))
 
 
 def _decoded(message: RawMessage, refusals: Refusals) -> tuple[object, ...]:
