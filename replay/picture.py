@@ -1,6 +1,5 @@
 """A frame drawn from above as a PNG, and the choice of the frame that is worth it. matplotlib is optional (`view`)."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -61,14 +60,6 @@ class BusiestMoment:
         now = busyness(result)
         if now > self._most:
             self._most, self.result = now, result
-
-
-def busiest_moment(results: Iterable[FrameResult]) -> FrameResult | None:
-    """Returns the busiest frame of a stream, None of an empty one; memory does not grow with the stream."""
-    moment = BusiestMoment()
-    for result in results:
-        moment.offer(result)
-    return moment.result
 
 
 def draw_top_down(result: FrameResult, path: Path) -> None:

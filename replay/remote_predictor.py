@@ -292,11 +292,11 @@ class RemotePredictor:
         try:
             self._wait_until_ready()
         except StartError as error:  # one that dies while it starts is one failure more, not the end
-            return self._replace(str(error))
+            self._replace(str(error))
+            return
         for sequence, payload in self._unanswered.items():
             if sequence not in self._answers:
                 self._publisher.put(payload, attachment=self._run)
-        return None
 
     def _start_child(self) -> None:
         assert self._child_arguments is not None

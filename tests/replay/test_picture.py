@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from replay.picture import BusiestMoment, PictureError, busiest_moment, busyness, draw_top_down
+from replay.picture import BusiestMoment, PictureError, busyness, draw_top_down
 from tests.replay.view_scenes import crowd
 
 pytest.importorskip("matplotlib", reason="matplotlib comes with pcgan[view]")
@@ -60,6 +60,13 @@ def test_an_empty_frame_without_truth_can_be_drawn(tmp_path):
 def test_a_place_that_cannot_be_written_is_named(tmp_path):
     with pytest.raises(PictureError, match=r"cannot write .*nowhere"):
         draw_top_down(next(crowd(people=2)), tmp_path / "nowhere" / "p.png")
+
+
+def busiest_moment(results):
+    moment = BusiestMoment()
+    for result in results:
+        moment.offer(result)
+    return moment.result
 
 
 def test_busiest_moment_is_the_one_with_most_to_see():
