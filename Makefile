@@ -17,10 +17,10 @@ demo: $(VENV)/demo
 	@echo "look at $(OUT)/demo.png, or: $(BIN)/rerun $(OUT)/demo.rrd"
 
 test: $(VENV)/dev lint
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow" -n 2 --dist worksteal
 
 test-slow: $(VENV)/dev
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow -n 2
 
 lint: $(VENV)/dev
 	$(BIN)/ruff format --check --quiet

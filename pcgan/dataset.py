@@ -1,6 +1,8 @@
-"""Windows of observed and future steps, from annotated clips or from a tracker's output, and batches of them.
+"""Windows of observed and future steps: the one representation that every predictor learns from and is scored on.
 
-Clips are resampled (linear interpolation) to a grid of 10 Hz or the model's own rate. From a clip come clean windows,
+Annotated clips are resampled (linear interpolation) to a grid of 10 Hz or the model's own rate; where the annotation
+has the model's rate, it is taken as it is. A window holds everybody who is there at its last observed step and was seen
+at least once before: not all have been seen throughout, and not all stay to the end. From a clip come clean windows,
 whose present velocity is the weighted mean of the observed displacements, and on request windows as a tracker would see
 them: noisy positions run through the steady-state alpha-beta filter (Kalata 1984) of the tracker's motion model.
 
@@ -36,20 +38,40 @@ _BURN_IN_STEPS = 5  # a filter's first steps are dropped
 class Windows:
     """N observed pedestrians, each in a scene with those seen at the same time; sorted by scene, float32."""
 
-    observed: FloatArray  # (N, T, 2) m, origin at the scene's mean present position
+    observed: FloatArray  # (N, T, 2) m, origin at the scene's mean present position; filled in where not seen
+    seen: BoolArray  # (N, T)    whether somebody was seen at that step; at the last one and at an earlier one always
     velocity: FloatArray  # (N, 2)    m/s at the last observed step
-    future: FloatArray  # (N, P, 2) m, same origin; NaN rows where it is not known to the end
+    future: FloatArray  # (N, P, 2) m, same origin; NaN where it is not known
     vehicle: FloatArray  # (N, T, 4) x, y, vx, vy of the nearest vehicle, same origin; NaN where there is none
     scene: IntArray  # (N,)    0.., rising
     annotated: BoolArray  # (N,)    clean annotation, which training may add noise to
+    dt_s: float  # seconds per step
 
     def __len__(self) -> int:
         return len(self.scene)
 
     @property
     def known(self) -> BoolArray:
-        """(N,) whether the future is known to the end."""
-        return np.asarray(np.isfinite(self.future).all(axis=(1, 2)))
+        """(N, P) at which steps the future is known."""
+        return np.asarray(np.isfinite(self.future).all(axis=2))
+
+    @property
+    def complete(self) -> BoolArray:
+        """(N,) who was seen at every observed step."""
+        return np.asarray(self.seen.all(axis=1))
+
+    def select(self, rows: BoolArray) -> "Windows":
+        """Returns the pedestrians where `rows` (N,) is true, scenes numbered anew."""
+        return Windows(
+            observed=self.observed[rows],
+            seen=self.seen[rows],
+            velocity=self.velocity[rows],
+            future=self.future[rows],
+            vehicle=self.vehicle[rows],
+            scene=np.unique(self.scene[rows], return_inverse=True)[1].astype(np.int64),
+            annotated=self.annotated[rows],
+            dt_s=self.dt_s,
+        )
 
 
 @dataclass(frozen=True)
@@ -60,11 +82,12 @@ class WindowSpec:
     predicted_steps: int
     dt_s: float
     stride_s: float = 0.2
+    known_steps: int | None = None  # a scene is kept if somebody's future is known this far; None: to the end
+    most_vehicles: int | None = None  # a scene is left out if more are seen at any of its steps
 
-    @property
-    def fine_steps(self) -> int:
-        """Grid steps per window step: the grid is the nearest to 10 Hz that divides dt_s."""
-        return max(1, round(self.dt_s / SCAN_PERIOD_S))
+    def fine_steps(self, rate_hz: float) -> int:
+        """Grid steps per window step: the grid is the nearest to 10 Hz, or to a slower clip's, that divides dt_s."""
+        return max(1, round(self.dt_s * min(rate_hz, 1 / SCAN_PERIOD_S)))
 
 
 def training_clip_names(data_dir: Path | None = None) -> tuple[str, ...]:
@@ -80,15 +103,20 @@ def refuse_held_out(names: tuple[str, ...]) -> None:
         raise ValueError(f"held-out clips may not be trained or validated on: {', '.join(bad)}")
 
 
-def weighted_velocity(observed: FloatArray, dt_s: float) -> FloatArray:
-    """(..., T, 2) m -> (..., 2) m/s: mean of the displacements, weights 0.5^age, the last having age 0."""
+def weighted_velocity(observed: FloatArray, dt_s: float, seen: BoolArray | None = None) -> FloatArray:
+    """(..., T, 2) m -> (..., 2) m/s: mean of the displacements, weights 0.5^age, the last having age 0.
+
+    With `seen` (..., T), displacements from before the first seen step, which only fill in, do not count.
+    """
     displacements = np.diff(observed, axis=-2) / dt_s
-    weights = 0.5 ** np.arange(displacements.shape[-2])[::-1]
-    return np.asarray((displacements * (weights / weights.sum())[:, None]).sum(axis=-2))
+    weights = np.broadcast_to(0.5 ** np.arange(displacements.shape[-2])[::-1], displacements.shape[:-1])
+    if seen is not None:
+        weights = weights * np.maximum.accumulate(seen, axis=-1)[..., :-1]
+    return np.asarray((displacements * (weights / weights.sum(axis=-1, keepdims=True))[..., None]).sum(axis=-2))
 
 
 def clip_windows(clip: Clip, spec: WindowSpec, noise_m: float = 0.0, rng: np.random.Generator | None = None) -> Windows:
-    """Returns the windows of one clip: everyone seen over the whole observation, at every stride.
+    """Returns the windows of one clip: at every stride, everyone seen at the last observed step and at an earlier one.
 
     Args:
         clip: positions in m.
@@ -99,50 +127,100 @@ def clip_windows(clip: Clip, spec: WindowSpec, noise_m: float = 0.0, rng: np.ran
 
     A clip shorter than the observation gives no windows.
     """
-    m, fine_s = spec.fine_steps, spec.dt_s / spec.fine_steps
+    m = spec.fine_steps(clip.rate_hz)
+    fine_s = spec.dt_s / m
     true, vehicles = _on_grid(clip, fine_s)  # (G, M, 2), (G, V, 4), NaN where absent
-    seen, velocity = true, None
+    measured, velocity = true, None
     if noise_m > 0:
         if rng is None:
             raise ValueError("noise_m needs an rng")
-        seen, velocity = _alpha_beta(true + rng.normal(0, noise_m, true.shape), noise_m, fine_s)
+        measured, velocity = _alpha_beta(true + rng.normal(0, noise_m, true.shape), noise_m, fine_s)
     T, P = spec.observed_steps, spec.predicted_steps
     starts = np.arange(0, len(true) - m * (T - 1), max(1, round(spec.stride_s / fine_s)))  # (W,)
-    observed = _cut(seen, starts, T, m)  # (W, M, T, 2)
+    observed = _cut(measured, starts, T, m)  # (W, M, T, 2)
     future = _cut(true, starts + m * T, P, m)
-    vehicle = _cut(vehicles, starts, T, m)  # (W, V, T, 4)
-    wanted = np.isfinite(observed).all(axis=(2, 3))  # (W, M)
-    learnable = wanted & np.isfinite(future).all(axis=(2, 3))
-    wanted &= learnable.max(axis=1, initial=False)[:, None]  # scenes with at least one known future
+    vehicle = _cut(vehicles, starts, T + P, m)  # (W, V, T + P, 4)
+    seen: BoolArray = np.asarray(np.isfinite(observed).all(axis=3))  # (W, M, T)
+    wanted = seen[:, :, -1] & (seen.sum(axis=2) >= 2)  # (W, M)
+    learnable = wanted & np.isfinite(future[:, :, : spec.known_steps]).all(axis=(2, 3))
+    wanted &= learnable.max(axis=1, initial=False)[:, None]
+    if spec.most_vehicles is not None:
+        met: BoolArray = np.asarray(np.isfinite(vehicle).all(axis=3))  # (W, V, T + P)
+        wanted &= (met.any(axis=2).sum(axis=1) <= spec.most_vehicles)[:, None]
     scene, who = np.nonzero(wanted)
-    observed, future = observed[scene, who], future[scene, who]  # (N, T, 2), (N, P, 2)
-    future[~np.isfinite(future).all(axis=(1, 2))] = np.nan
+    seen = seen[scene, who]
+    observed = filled_in(observed[scene, who], seen)  # (N, T, 2)
     present = starts[scene] + m * (T - 1)
-    speeds = weighted_velocity(observed, spec.dt_s) if velocity is None else velocity[present, who]
-    nearest = _nearest_vehicle(vehicle[scene], observed[:, -1])
-    scene = np.unique(scene, return_inverse=True)[1].astype(np.int64)
+    speeds = weighted_velocity(observed, spec.dt_s, seen) if velocity is None else velocity[present, who]
+    nearest = _nearest_vehicle(vehicle[scene][:, :, :T], observed[:, -1])
     return centred(
         observed=observed,
+        seen=seen,
         velocity=speeds,
-        future=future,
+        future=future[scene, who],
         vehicle=nearest,
-        scene=scene,
+        scene=np.unique(scene, return_inverse=True)[1].astype(np.int64),
         annotated=np.full(len(scene), velocity is None),
+        dt_s=spec.dt_s,
+    )
+
+
+def filled_in(observed: FloatArray, seen: BoolArray) -> FloatArray:
+    """(N, T, 2) m, (N, T) -> (N, T, 2): unseen steps between seen ones interpolated, those before the first like it."""
+    if seen.all():
+        return observed
+    T = seen.shape[1]
+    index = np.arange(T)
+    before = np.maximum.accumulate(np.where(seen, index, -1), axis=1)  # (N, T) the last seen step up to here
+    after = np.minimum.accumulate(np.where(seen, index, T)[:, ::-1], axis=1)[:, ::-1]
+    after = np.minimum(after, T - 1)  # the last step is always seen
+    before = np.where(before < 0, after, before)
+    row = np.arange(len(observed))[:, None]
+    fraction = (index - before) / np.maximum(after - before, 1)
+    start, end = observed[row, before], observed[row, after]
+    return np.asarray(start + fraction[..., None] * (end - start))
+
+
+def reversed_in_time(windows: Windows) -> Windows:
+    """Returns the windows with time run backwards, as more people to learn from; without vehicles.
+
+    Whoever is not there at the new last observed step, or at no other observed one, drops out.
+    """
+    T = windows.observed.shape[1]
+    positions = np.concatenate([windows.observed, windows.future], axis=1)[:, ::-1]  # (N, T + P, 2)
+    there = np.concatenate([windows.seen, windows.known], axis=1)[:, ::-1]
+    wanted = there[:, T - 1] & (there[:, :T].sum(axis=1) >= 2)
+    positions, there = positions[wanted].astype(np.float64), there[wanted]
+    observed = filled_in(positions[:, :T], there[:, :T])
+    return centred(
+        observed=observed,
+        seen=there[:, :T],
+        velocity=weighted_velocity(observed, windows.dt_s, there[:, :T]),
+        future=np.where(there[:, T:, None], positions[:, T:], np.nan),
+        vehicle=np.full_like(windows.vehicle[wanted], np.nan),
+        scene=np.unique(windows.scene[wanted], return_inverse=True)[1].astype(np.int64),
+        annotated=windows.annotated[wanted],
+        dt_s=windows.dt_s,
     )
 
 
 def concatenate(parts: list[Windows]) -> Windows:
-    """Returns all windows as one set, the scenes numbered on."""
+    """Returns all windows as one set, the scenes numbered on; raises ValueError if steps or dt_s differ."""
     if not parts:
         raise ValueError("no windows to concatenate")
+    kinds = {(p.observed.shape[1], p.future.shape[1], p.dt_s) for p in parts}
+    if len(kinds) > 1:
+        raise ValueError(f"windows of different (observed steps, predicted steps, dt_s): {sorted(kinds)}")
     offsets = np.cumsum([0] + [int(p.scene[-1]) + 1 if len(p) else 0 for p in parts[:-1]])
     return Windows(
         observed=np.concatenate([p.observed for p in parts]),
+        seen=np.concatenate([p.seen for p in parts]),
         velocity=np.concatenate([p.velocity for p in parts]),
         future=np.concatenate([p.future for p in parts]),
         vehicle=np.concatenate([p.vehicle for p in parts]),
         scene=np.concatenate([p.scene + offset for p, offset in zip(parts, offsets, strict=True)]),
         annotated=np.concatenate([p.annotated for p in parts]),
+        dt_s=parts[0].dt_s,
     )
 
 
@@ -154,23 +232,23 @@ def _on_grid(clip: Clip, step_s: float) -> tuple[FloatArray, FloatArray]:
     frames = [p.frames for p in clip.pedestrians] + [v.frames for v in clip.vehicles]
     if not frames:
         return np.zeros((0, 0, 2)), np.zeros((0, 0, 4))
-    begin = min(int(f[0]) for f in frames) / clip.rate_hz
-    end = max(int(f[-1]) for f in frames) / clip.rate_hz
-    grid_s = begin + step_s * np.arange(int((end - begin) / step_s + 1e-9) + 1)  # (G,)
+    step = step_s * clip.rate_hz  # in frames
+    step = round(step) if abs(step - round(step)) < 1e-6 else step  # where the grid is the annotation's: exactly
+    begin, end = min(int(f[0]) for f in frames), max(int(f[-1]) for f in frames)
+    grid = begin + step * np.arange(int((end - begin) / step + 1e-9) + 1)  # (G,)
 
     def sample(frames: IntArray, columns: FloatArray) -> FloatArray:
-        times = frames / clip.rate_hz
-        return np.stack([np.interp(grid_s, times, c, left=np.nan, right=np.nan) for c in columns.T], axis=-1)
+        return np.stack([np.interp(grid, frames, c, left=np.nan, right=np.nan) for c in columns.T], axis=-1)
 
     pedestrians = [sample(p.frames, p.positions_m) for p in clip.pedestrians]
     vehicles = []
     for v in clip.vehicles:
         velocity = v.speed_mps[:, None] * np.stack([np.cos(v.yaw_rad), np.sin(v.yaw_rad)], axis=-1)
         vehicles.append(sample(v.frames, np.concatenate([v.positions_m, velocity], axis=-1)))
-    empty = np.zeros((len(grid_s), 0))
+    empty = np.zeros((len(grid), 0))
     return (
-        np.stack(pedestrians, axis=1) if pedestrians else empty.reshape(len(grid_s), 0, 2),
-        np.stack(vehicles, axis=1) if vehicles else empty.reshape(len(grid_s), 0, 4),
+        np.stack(pedestrians, axis=1) if pedestrians else empty.reshape(len(grid), 0, 2),
+        np.stack(vehicles, axis=1) if vehicles else empty.reshape(len(grid), 0, 4),
     )
 
 
@@ -230,11 +308,13 @@ def _nearest_vehicle(vehicles: FloatArray, present: FloatArray) -> FloatArray:
 def centred(
     *,
     observed: FloatArray,
+    seen: BoolArray,
     velocity: FloatArray,
     future: FloatArray,
     vehicle: FloatArray,
     scene: IntArray,
     annotated: BoolArray,
+    dt_s: float,
 ) -> Windows:
     """Moves each scene's origin to the mean present position, in float64, and then rounds to float32."""
     count = np.bincount(scene) if len(scene) else np.zeros(0)
@@ -242,9 +322,11 @@ def centred(
     vehicle = vehicle - np.pad(origin, ((0, 0), (0, 2)))[:, None]
     return Windows(
         observed=(observed - origin[:, None]).astype(np.float32),
+        seen=seen,
         velocity=velocity.astype(np.float32),
         future=(future - origin[:, None]).astype(np.float32),
         vehicle=vehicle.astype(np.float32),
         scene=scene,
         annotated=annotated,
+        dt_s=dt_s,
     )

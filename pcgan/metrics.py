@@ -2,7 +2,10 @@
 
 import numpy as np
 
-from schemas.messages import FloatArray
+from schemas.messages import BoolArray, FloatArray
+
+MISS_M = 2.0  # a path that ends farther off has missed (Argoverse)
+COLLISION_M = 0.2  # two people nearer than this have collided
 
 
 def ade(predicted_m: FloatArray, true_m: FloatArray) -> FloatArray:
@@ -47,6 +50,20 @@ def nll(
     highest = log_density.max(axis=-1, keepdims=True)  # a weight of 0 gives exp(-inf), never all of them
     log_sum = np.log(np.exp(log_density - highest).sum(axis=-1)) + highest[..., 0]
     return np.asarray(-log_sum.mean(axis=-1))
+
+
+def collided(paths_m: FloatArray, there: BoolArray, threshold_m: float = COLLISION_M) -> BoolArray:
+    """(..., A, P, 2), (..., A, P) -> (..., A, P): who is nearer than 0.2 m to somebody else of the scene at a step.
+
+    Only people who are there at the step count. Between the steps nothing is looked at.
+    """
+    _require_paths(paths_m)
+    present = np.where(there[..., None], paths_m, np.nan).swapaxes(-2, -3)  # (..., P, A, 2)
+    x, y = present[..., 0], present[..., 1]
+    apart_x, apart_y = x[..., :, None] - x[..., None, :], y[..., :, None] - y[..., None, :]  # (..., P, A, A)
+    near = apart_x * apart_x + apart_y * apart_y < threshold_m * threshold_m  # False for NaN
+    near &= ~np.eye(near.shape[-1], dtype=bool)
+    return np.asarray(near.any(axis=-1).swapaxes(-1, -2))
 
 
 def _distances(predicted_m: FloatArray, true_m: FloatArray) -> FloatArray:

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcgan.dataset import VALIDATION_CLIPS, Windows, WindowSpec, centred, refuse_held_out
-from schemas.messages import FloatArray, IntArray
+from schemas.messages import BoolArray, FloatArray, IntArray
 
-_FORMAT = 1
+_FORMAT = 2
 
 
 class WindowsError(ValueError):
@@ -25,6 +25,7 @@ def save_windows(
     path: Path,
     *,
     observed: FloatArray,
+    seen: BoolArray,
     velocity: FloatArray,
     future: FloatArray,
     scene: IntArray,
@@ -36,9 +37,10 @@ def save_windows(
 
     Args:
         path: the file to write.
-        observed: (N, T, 2) track positions in m, any origin.
+        observed: (N, T, 2) track positions in m, any origin, filled in where not seen.
+        seen: (N, T) at which steps.
         velocity: (N, 2) the tracks' present velocity in m/s.
-        future: (N, P, 2) ground truth in m; NaN rows where it is not known to the end.
+        future: (N, P, 2) ground truth in m; NaN where it is not known.
         scene: (N,) 0..S-1, which frame of which drive, rising.
         vehicle: (S, T, 4) x, y, vx, vy; NaN where there is none.
         clips: S names of the clips the scenes were simulated from, e.g. "dut/roundabout_02"; they decide which
@@ -48,6 +50,7 @@ def save_windows(
     val = np.array([clip in VALIDATION_CLIPS for clip in clips], bool)
     arrays: dict[str, NDArray[Any]] = {
         "observed": np.asarray(observed, np.float64),
+        "seen": np.asarray(seen, bool),
         "velocity": np.asarray(velocity, np.float64),
         "future": np.asarray(future, np.float64),
         "scene": np.asarray(scene, np.int64),
@@ -77,9 +80,8 @@ def load_windows(path: Path, spec: WindowSpec) -> tuple[Windows, Windows]:
     wanted = (spec.observed_steps, spec.predicted_steps, spec.dt_s)
     if found[:2] != wanted[:2] or abs(found[2] - wanted[2]) > 1e-9:
         raise WindowsError(f"{path} has (observed steps, predicted steps, dt_s) {found}; the model needs {wanted}")
-    scene, future = arrays["scene"], arrays["future"].copy()
-    known = np.isfinite(future).all(axis=(1, 2))
-    future[~known] = np.nan
+    scene, future = arrays["scene"], arrays["future"]
+    known = np.isfinite(future).all(axis=2).any(axis=1)
     learnable = np.zeros(len(arrays["vehicle"]), bool)
     learnable[scene[known]] = True
     parts = []
@@ -88,18 +90,20 @@ def load_windows(path: Path, spec: WindowSpec) -> tuple[Windows, Windows]:
         parts.append(
             centred(
                 observed=arrays["observed"][chosen],
+                seen=arrays["seen"][chosen],
                 velocity=arrays["velocity"][chosen],
                 future=future[chosen],
                 vehicle=arrays["vehicle"][scene[chosen]],
                 scene=np.unique(scene[chosen], return_inverse=True)[1].astype(np.int64),
                 annotated=np.zeros(int(chosen.sum()), bool),
+                dt_s=spec.dt_s,
             )
         )
     return parts[0], parts[1]
 
 
 def _check_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    names = {"observed", "velocity", "future", "scene", "vehicle", "validation", "clip", "dt_s", "format"}
+    names = {"observed", "seen", "velocity", "future", "scene", "vehicle", "validation", "clip", "dt_s", "format"}
     if missing := sorted(names - arrays.keys()):
         raise WindowsError(f"{path} lacks the arrays {missing}")
     if int(arrays["format"]) != _FORMAT:
@@ -109,8 +113,8 @@ def _check_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
         raise WindowsError(f"{path}: observed and future must have shape (N, steps, 2)")
     T, P = arrays["observed"].shape[1], arrays["future"].shape[1]
     wanted = {
-        "observed": (N, T, 2), "velocity": (N, 2), "future": (N, P, 2), "vehicle": (S, T, 4), "validation": (S,),
-        "clip": (S,),
+        "observed": (N, T, 2), "seen": (N, T), "velocity": (N, 2), "future": (N, P, 2), "vehicle": (S, T, 4),
+        "validation": (S,), "clip": (S,),
     }  # fmt: skip
     for name, shape in wanted.items():
         if arrays[name].shape != shape:
@@ -121,4 +125,6 @@ def _check_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     for name in ("observed", "velocity"):
         if not np.isfinite(arrays[name]).all():
             raise WindowsError(f"{path}: {name} holds NaN or infinity")
+    if N and not (arrays["seen"][:, -1] & (arrays["seen"].sum(axis=1) >= 2)).all():
+        raise WindowsError(f"{path}: everybody must be seen at the last step and at an earlier one")
     refuse_held_out(tuple(str(clip) for clip in np.unique(arrays["clip"])))

@@ -105,7 +105,7 @@ def dashes(strip_m: FloatArray, dash_m: float = 0.35, gap_m: float = 0.3) -> Flo
 
 
 def split_by_fallback(predictions: Sequence[Prediction]) -> tuple[list[Prediction], list[Prediction]]:
-    """Returns the model's own predictions, and those that extrapolate because the track was not seen throughout."""
+    """Returns the model's own predictions, and those that extrapolate because the track is too young or coasting."""
     return [p for p in predictions if not p.fallback], [p for p in predictions if p.fallback]
 
 

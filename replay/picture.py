@@ -231,7 +231,7 @@ def _draw_legend(figure: Any, result: FrameResult) -> None:
         (line((*one, 1.0), linewidth=2.6), "modal path, likely"),
         (line((*one, 0.4), linewidth=1.3), "modal path, unlikely"),
         (Patch(facecolor=(*other, 0.35), edgecolor="none"), "predicted mixture"),
-        (line(_hex(colours.FALLBACK), linewidth=1.1, linestyle=(0, (3, 2.5))), "fallback: not seen throughout"),
+        (line(_hex(colours.FALLBACK), linewidth=1.1, linestyle=(0, (3, 2.5))), "fallback: too young, or coasting"),
         (mark(colours.probability_colours([0.95])[0] / 255, "o", 4), "fused measurement, a person"),
         (mark(colours.probability_colours([0.05])[0] / 255, "o", 4), "fused measurement, no person"),
         (mark(_hex(colours.CLUSTER), "s", 6, markerfacecolor="none"), "LiDAR cluster"),

@@ -60,12 +60,12 @@ class InlinePredictor:
 
     restarts = 0
 
-    def __init__(self, model_path: Path | None = None):
-        from pcgan.checkpoint import CheckpointError  # torch is loaded only here
+    def __init__(self, model: str | Path | None = None):
+        from pcgan.checkpoint import CheckpointError, find_model  # torch is loaded only here
         from pcgan.predictor import Predictor
 
         try:
-            self._predictor = Predictor.from_checkpoint(model_path)
+            self._predictor = Predictor.from_checkpoint(find_model(model))
         except CheckpointError as error:
             raise PredictorError(str(error)) from error
         self.model = ModelIdentity(self._predictor.model_name, self._predictor.checksum)
@@ -90,10 +90,10 @@ class StartError(PredictorError):
 class Child:
     """A predictor process of our own, in its own process session so that Ctrl-C does not reach it."""
 
-    def __init__(self, endpoint: str, model_path: Path | None, log: IO[bytes]):
+    def __init__(self, endpoint: str, model: str | Path | None, log: IO[bytes]):
         command = [sys.executable, "-m", "replay.cli", "predict", "--spawned", "--connect", endpoint]
-        if model_path is not None:
-            command += ["--model", str(model_path)]
+        if model is not None:
+            command += ["--model", str(model)]
         self._log = log
         self._log_start = log.tell()
         self._process = subprocess.Popen(
@@ -144,7 +144,7 @@ class RemotePredictor:
         self._max_failures = max_failures
         self._run = secrets.token_bytes(8)  # tells our answers from another replay's; never in an output
         self._child: Child | None = None
-        self._child_arguments: tuple[str, Path | None] | None = None
+        self._child_arguments: tuple[str, str | Path | None] | None = None
         self._folder: Path | None = None
         self._log: IO[bytes] | None = None
         self._unanswered: OrderedDict[int, bytes] = OrderedDict()
@@ -171,7 +171,7 @@ class RemotePredictor:
         )
 
     @classmethod
-    def spawned(cls, model_path: Path | None = None, **options: float) -> Self:
+    def spawned(cls, model: str | Path | None = None, **options: float) -> Self:
         """Starts a predictor process of our own on a private socket and waits until it serves."""
         folder = Path(tempfile.mkdtemp(prefix="pcgan-"))
         endpoint = _private_endpoint(folder)
@@ -182,7 +182,7 @@ class RemotePredictor:
             raise
         predictor._folder = folder
         predictor._log = (folder / "predictor.log").open("w+b")
-        predictor._child_arguments = (endpoint, model_path)
+        predictor._child_arguments = (endpoint, model)
         try:
             predictor._start_child()
             predictor._wait_until_ready()
@@ -301,9 +301,9 @@ class RemotePredictor:
     def _start_child(self) -> None:
         assert self._child_arguments is not None
         assert self._log is not None
-        endpoint, model_path = self._child_arguments
+        endpoint, model = self._child_arguments
         self._log.seek(0, 2)
-        self._child = Child(endpoint, model_path, self._log)
+        self._child = Child(endpoint, model, self._log)
 
     def _wait_until_ready(self) -> None:
         """Waits for a predictor's token and for zenoh to have matched our publisher: what is put before is lost."""

@@ -52,7 +52,7 @@ LEGEND = """
 Thin line behind it: the last 3.6 s.
 
 **Lines ahead**: modal paths, opaque if likely. **Clouds**: the mixture, one sigma, half way and at the end.
-Grey dashes: fallback, not seen throughout the last steps.
+Grey dashes: fallback, the track is too young or coasting.
 
 **Dot**: fused measurement, slate (hardly a person) to cream (surely one).
 Grey box: LiDAR cluster. Grey cross: ground truth.

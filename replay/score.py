@@ -197,7 +197,7 @@ class _Batch:
     def compare(self, ids: IntArray, seen: Sequence[Positions], errors: dict[str, Errors]) -> None:
         """Adds the errors against where `ids` (N,) were seen later; -1 is nobody."""
         positions, known = lookup(seen, ids, self.steps_ns)
-        rows = np.flatnonzero(known & (ids >= 0))
+        rows = np.flatnonzero(known.all(axis=1) & (ids >= 0))
         if len(rows) == 0:
             return
         true = positions[rows]
@@ -225,14 +225,14 @@ def lookup(seen: Sequence[Positions], ids: IntArray, steps_ns: IntArray) -> tupl
         steps_ns: (A, P) when, or (P,) for all.
 
     Returns:
-        positions (A, P, 2) in m, and (A,) who was measured around every step, at most MAX_GAP_NS apart; the positions
-        of others mean nothing.
+        positions (A, P, 2) in m, and (A, P) whether they were measured around that step, at most MAX_GAP_NS apart;
+        other positions mean nothing.
     """
     steps_ns = np.broadcast_to(steps_ns, (len(ids), steps_ns.shape[-1]))
     window = [frame for frame in seen if len(ids) and frame.stamp_ns <= steps_ns.max() + MAX_GAP_NS]
     F = len(window)
     if F == 0:
-        return np.zeros((*steps_ns.shape, 2)), np.zeros(len(ids), bool)
+        return np.zeros((*steps_ns.shape, 2)), np.zeros(steps_ns.shape, bool)
     # who was where, as a table of F frames and U different ids
     unique, column = np.unique(ids, return_inverse=True)
     everybody = np.concatenate([frame.ids for frame in window])
@@ -258,7 +258,7 @@ def lookup(seen: Sequence[Positions], ids: IntArray, steps_ns: IntArray) -> tupl
     gap_ns = stamps[high] - stamps[low]
     fraction = (steps_ns - stamps[low]) / np.maximum(gap_ns, 1)
     start, end = positions[low, column], positions[high, column]  # (A, P, 2)
-    return start + fraction[..., None] * (end - start), np.asarray((inside & (gap_ns <= MAX_GAP_NS)).all(axis=1))
+    return start + fraction[..., None] * (end - start), np.asarray(inside & (gap_ns <= MAX_GAP_NS))
 
 
 def _track_positions(stamp_ns: int, tracks: Sequence[Track]) -> Positions:

@@ -48,7 +48,7 @@ class PredictorChoice:
     """Which predictor answers, and where; changes no result but through its weights."""
 
     mode: PredictorMode = "spawned"
-    model: Path | None = None  # None: the weights that ship
+    model: str | Path | None = None  # name of a shipped model, or a file; None: the default
     connect: str | None = None  # endpoint of an external predictor
     zenoh_config: Path | None = None
     namespace: str = ""

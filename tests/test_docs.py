@@ -13,6 +13,7 @@ import pytest
 import typer
 from google.protobuf.descriptor import FieldDescriptor
 
+from pcgan.checkpoint import DEFAULT_CHECKPOINT
 from pcgan.dataset import HELD_OUT_CLIPS, VALIDATION_CLIPS
 from replay import PredictorChoice, Replay
 from replay.cli import app
@@ -30,7 +31,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CHANGELOG.md", "CONTRIBUTING.md")]
 PAGES += sorted(DOCS.glob("*.md"))
-COMMANDS = typer.main.get_command(app).commands
+COMMANDS = typer.main.get_command(app).commands  # `data` is a group, with commands of its own
 
 every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
@@ -69,12 +70,33 @@ def anchors(page):
 
 # --- commands ---------------------------------------------------------------------------------------------------------
 
+
+def command_of(words):
+    """The command that the words after `pcgan` call, its name, and what is left of the words: its arguments."""
+    name, *rest = words
+    command, path = COMMANDS[name], name
+    while hasattr(command, "commands"):
+        name, *rest = rest
+        command, path = command.commands[name], f"{path} {name}"
+    return command, path, rest
+
+
+def leaves(name, command):
+    """Every command by the words after `pcgan`; of a group, what is in it."""
+    if not hasattr(command, "commands"):
+        return {name: command}
+    return {
+        path: leaf for word, part in command.commands.items() for path, leaf in leaves(f"{name} {word}", part).items()
+    }
+
+
+LEAVES = {path: leaf for name, command in COMMANDS.items() for path, leaf in leaves(name, command).items()}
 SHELL = [(page.name, line) for page in PAGES for line in shell_lines(page)]
 
 
 def test_every_subcommand_is_shown_somewhere():
-    shown = {shlex.split(line)[1] for _, line in SHELL if line.startswith("pcgan ")}
-    assert shown == set(COMMANDS)
+    shown = {command_of(shlex.split(line)[1:])[1] for _, line in SHELL if line.startswith("pcgan ")}
+    assert shown == set(LEAVES)
     readme = {shlex.split(line)[1] for name, line in SHELL if name == "README.md" and line.startswith("pcgan ")}
     assert {"info", "replay", "predict"} <= readme
 
@@ -83,8 +105,8 @@ def test_every_subcommand_is_shown_somewhere():
 def test_shown_commands_exist_and_parse(page, line):  # noqa: ARG001  names the page where it fails
     program, *arguments = shlex.split(line.split(" | ")[0])
     if program == "pcgan":
-        command = COMMANDS[arguments[0]]
-        assert command.make_context(arguments[0], arguments[1:]).params
+        command, name, rest = command_of(arguments)
+        assert command.make_context(name, rest).params is not None
     elif program == "make":
         assert re.search(rf"^{arguments[0]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
     elif program == "python":
@@ -94,10 +116,10 @@ def test_shown_commands_exist_and_parse(page, line):  # noqa: ARG001  names the 
         assert program in {"rerun", "apt-get", "ruff", "mypy", "pytest"}
 
 
-@pytest.mark.parametrize("name", sorted(COMMANDS))
+@pytest.mark.parametrize("name", sorted({*COMMANDS, *LEAVES}))
 def test_help_of_every_command(name, capsys):
     with pytest.raises(SystemExit) as ending:
-        typer.main.get_command(app).main([name, "--help"], prog_name="pcgan")
+        typer.main.get_command(app).main([*name.split(), "--help"], prog_name="pcgan")
     assert ending.value.code == 0
     assert f"pcgan {name}" in capsys.readouterr().out
 
@@ -108,7 +130,7 @@ def test_cli_page_has_every_option_and_no_other(name):
     table = [row for row in rows(section) if row[0] != "option"]
     documented = [word for row in table for word in code_of(row[0])]
     wanted = []
-    for parameter in COMMANDS[name].params:
+    for parameter in (each for leaf in leaves(name, COMMANDS[name]).values() for each in leaf.params):
         is_argument = not parameter.opts[0].startswith("-")
         if not getattr(parameter, "hidden", False):
             wanted += [parameter.metavar] if is_argument else [*parameter.opts, *parameter.secondary_opts]
@@ -248,7 +270,7 @@ def test_the_client_snippet_gets_answers_from_the_command(folder):
         client = subprocess.run(
             [sys.executable, "client.py"], timeout=60, check=True, capture_output=True, text=True, cwd=folder
         )
-        assert client.stdout.strip() == "vehicle_10hz"
+        assert client.stdout.strip() == DEFAULT_CHECKPOINT.stem
         server.terminate()
         assert server.wait(10) == 0
     finally:

@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+from pcgan.clips import TRAJECTORY_SUFFIXES
 from replay.simulator import drive
 from replay.simulator.clip_motion import clip_motion
 from replay.simulator.drive import DriveSummary, Progress
@@ -52,7 +53,8 @@ def simulate(
         settings: dict[str, object] = {"pedestrians": pedestrians, "duration_s": duration_s}
     else:
         motion = clip_motion(clip, vehicle, seed)
-        settings = {"clip": clip, "vehicle": vehicle, "duration_s": duration_s}
+        is_file = clip.endswith(TRAJECTORY_SUFFIXES)
+        settings = {"clip": Path(clip).name if is_file else clip, "vehicle": vehicle, "duration_s": duration_s}
     return drive.simulate(
         motion, output, seed, duration_s=duration_s, settings={**settings, "seed": seed}, progress=progress
     )

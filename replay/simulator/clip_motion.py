@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from pcgan.clips import Clip, VehicleTrajectory, clip_names, load_clip
+from pcgan.clips import TRAJECTORY_SUFFIXES, Clip, VehicleTrajectory, clip_names, load_clip
 from replay.simulator.motion import Fixtures, Motion, OtherVehicles, People, Scene, SimulationError, VehicleState
 from replay.simulator.surroundings import CELL_M, SHARE, fixtures_from_rows, pole_or_bush
 from schemas.messages import FloatArray
 
 # length, width, height and how far the box's centre is ahead of the annotated point, m
-_BOXES = {"dut": ((4.5, 1.8, 1.5), 0.0), "citr": ((2.2, 1.2, 1.8), -0.1)}
+_CAR = ((4.5, 1.8, 1.5), 0.0)
+_BOXES = {"dut": _CAR, "citr": ((2.2, 1.2, 1.8), -0.1)}  # a car elsewhere
 MOVES_MPS = 1.0  # a vehicle that reaches this moves
 STEADY_MPS = 0.6  # below this the annotated heading of a vehicle is not trusted
 _SMOOTHING_S = 0.4
@@ -29,11 +30,12 @@ def clip_motion(name: str, vehicle_id: int | None = None, seed: int = 0, data_di
     """Returns the drive of one annotated vehicle of a clip, from its first frame to its last.
 
     Args:
-        name: e.g. "dut/roundabout_04", see `pcgan.clips`.
+        name: e.g. "dut/roundabout_04", or the path of a trajectory file, see `pcgan.clips.load_clip`.
         vehicle_id: which vehicle records; the one that moves and is present longest if None.
         seed: where poles and bushes stand, never nearer than 0.8 m to anybody's path.
 
-    Raises SimulationError naming the clips or vehicles that there are; DataNotFound if the data set is missing.
+    Raises SimulationError naming the clips or vehicles that there are; DataNotFound if the data set or file is missing;
+    ClipError if the file is not what it should be.
     """
     return motion_of(_load(name, data_dir), vehicle_id, seed)
 
@@ -48,11 +50,16 @@ def motion_of(clip: Clip, vehicle_id: int | None = None, seed: int = 0) -> Motio
 
 
 def _load(name: str, data_dir: Path | None) -> Clip:
+    if name.endswith(TRAJECTORY_SUFFIXES):
+        return load_clip(name)
     dataset = name.partition("/")[0]
     try:
         known = clip_names(dataset, data_dir)
     except ValueError as error:  # no such data set
-        raise SimulationError(f"no clip {name!r}: {error}; clips are named like dut/roundabout_04") from error
+        raise SimulationError(
+            f"no clip {name!r}: {error}; clips are named like dut/roundabout_04, and trajectory files end in"
+            f" {', '.join(TRAJECTORY_SUFFIXES)}"
+        ) from error
     if name not in known:
         raise SimulationError(f"no clip {name!r}; there are {', '.join(known)}")
     return load_clip(name, data_dir)
@@ -109,7 +116,7 @@ def _scenes(clip: Clip, vehicle: VehicleTrajectory, seed: int) -> Iterator[Scene
     velocities = smooth_velocities(vehicle.positions_m, rate)
     yaws = steady_yaws(vehicle, rate)
     yaw_rates = np.gradient(yaws) * rate
-    size, ahead = _BOXES[clip.name.partition("/")[0]]
+    size, ahead = _BOXES.get(clip.name.partition("/")[0], _CAR)
     others = [(other, steady_yaws(other, rate)) for other in clip.vehicles if other.id != vehicle.id]
     fixtures = _fixtures(clip, seed)
     for k, frame in enumerate(vehicle.frames):

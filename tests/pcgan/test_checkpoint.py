@@ -10,7 +10,16 @@ import torch
 
 from pcgan import checkpoint
 from pcgan.checkpoint import CheckpointError
-from pcgan.model import ModelConfig
+from pcgan.model import Generator, ModelConfig
+from pcgan.sgan import SganConfig, SganGenerator
+from pcgan.sr_lstm import SrLstm, SrLstmConfig
+
+KINDS = {
+    "pcgan": (ModelConfig(hidden=8, embedding=4, mlp=8), Generator),
+    "psgan": (ModelConfig(hidden=8, embedding=4, mlp=8, pooling="social", recipe="paper"), Generator),
+    "sgan": (SganConfig(pooling_hidden=16, mlp=8), SganGenerator),
+    "srlstm": (SrLstmConfig(hidden=8, embedding=4), SrLstm),
+}
 
 
 @pytest.fixture
@@ -22,7 +31,7 @@ def saved(tmp_path, make_generator):
 
 
 def rewrite(path, change_header=None, change_tensors=None):
-    header = {"format": 1, "name": "x", "config": asdict(ModelConfig(dt_s=0.4)), "training": {}}
+    header = {"format": 2, "name": "x", "network": "pcgan", "config": asdict(ModelConfig(dt_s=0.4)), "training": {}}
     tensors = safetensors.torch.load_file(path)
     if change_tensors:
         change_tensors(tensors)
@@ -41,6 +50,57 @@ def test_round_trip(saved):
     for name, tensor in generator.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], tensor)
     assert not loaded.training
+
+
+@pytest.fixture
+def save_kind(tmp_path):
+    """Saves a network of one of the kinds with random weights and buffers."""
+
+    def save(kind):
+        config, _ = KINDS[kind]
+        path = tmp_path / f"{kind}.safetensors"
+        with torch.random.fork_rng(devices=()):
+            torch.manual_seed(3)
+            network = checkpoint.build(config)
+            for buffer in network.buffers():
+                buffer.copy_(torch.rand(buffer.shape))
+        checkpoint.save(path, config, network.state_dict(), {"data": "vci"})
+        return path, network
+
+    return save
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_network_comes_back(save_kind, kind):
+    """Weights and what was fitted after training, which are buffers; and the header alone says what it is."""
+    path, network = save_kind(kind)
+    loaded, content = checkpoint.load_network(path)
+    config, type_ = KINDS[kind]
+    assert type(loaded) is type_
+    assert content.config == loaded.config == config
+    assert len(list(network.buffers())) == 1
+    for name, tensor in network.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], tensor)
+    assert not loaded.training
+    described = checkpoint.describe(path)
+    assert (described.name, described.config, described.training) == (kind, config, {"data": "vci"})
+    assert described.network == ("pcgan" if type_ is Generator else kind)
+    assert described.horizon_s == pytest.approx(12 * config.dt_s)
+    assert described.uses_vehicle == (type_ is Generator)
+
+
+@pytest.mark.parametrize(("kind", "name"), [("sgan", "SganGenerator"), ("srlstm", "SrLstm")])
+def test_other_networks_are_no_generator(save_kind, kind, name):
+    path, _ = save_kind(kind)
+    with pytest.raises(CheckpointError, match=rf"{kind}\.safetensors is a {name}; .* PCGAN or PSGAN generator"):
+        checkpoint.load_generator(path)
+
+
+def test_network_of_a_kind_has_a_config_of_that_kind(save_kind):
+    path, _ = save_kind("pcgan")
+    rewrite(path, lambda h: h.update(network="srlstm"))
+    with pytest.raises(CheckpointError, match="SR-LSTM configuration differs in the fields"):
+        checkpoint.load_network(path)
 
 
 def test_equal_weights_have_equal_bytes(saved, tmp_path):
@@ -80,13 +140,18 @@ def test_pickle_is_never_opened(tmp_path):
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
-        (lambda h: h.update(format=2), "format 2; this version reads 1"),
+        (lambda h: h.update(format=1), r"small\.safetensors is of checkpoint format 1; this version reads 2"),
+        (lambda h: h.update(format=3), "format 3; this version reads 2"),
+        (lambda h: h.pop("format"), "header that cannot be read"),
+        (lambda h: h.update(network="wgan"), r"network 'wgan' .*pcgan, sgan, srlstm"),
+        (lambda h: h.pop("network"), "network"),
         (lambda h: h["config"].update(hidden=16), r"weight .* is .*its configuration needs"),
         (lambda h: h["config"].update(colour="red"), "colour"),
         (lambda h: h["config"].pop("dt_s"), "dt_s"),
         (lambda h: h["config"].update(hidden="32"), "hidden is '32', not a int"),
         (lambda h: h["config"].update(recipe="paper"), "differ in the weights"),
         (lambda h: h["config"].update(uses_vehicle=False), "gvat.phi_vehicle"),
+        (lambda h: h["config"].update(pooling="social"), "differ in the weights"),
         (lambda h: h["config"].update(dt_s=-1.0), "dt_s must be positive"),
         (lambda h: h.pop("config"), "config"),
         (lambda h: h.update(config=[1]), "small.safetensors"),
@@ -97,6 +162,27 @@ def test_header_that_differs_is_refused(saved, change, problem):
     rewrite(path, change)
     with pytest.raises(CheckpointError, match=problem):
         checkpoint.load_generator(path)
+
+
+def test_format_of_before_is_refused_by_its_header_alone(saved):
+    """As files of format 1 were: no kind of network, other fields in the configuration."""
+    path, _ = saved
+
+    def older(header):
+        header.update(format=1)
+        del header["network"], header["config"]["pooling"]
+
+    rewrite(path, older)
+    for look in (checkpoint.describe, checkpoint.load, checkpoint.load_network, checkpoint.load_generator):
+        with pytest.raises(CheckpointError, match=r"small\.safetensors is of checkpoint format 1; this version"):
+            look(path)
+
+
+def test_what_is_far_too_large_is_not_read(saved, monkeypatch):
+    path, _ = saved
+    monkeypatch.setattr(checkpoint, "MAX_BYTES", 1000)
+    with pytest.raises(CheckpointError, match=r"bytes, more than any checkpoint \(1000\)"):
+        checkpoint.load(path)
 
 
 @pytest.mark.parametrize("place", [0.5, 0.9, 0.999])
@@ -126,6 +212,9 @@ def test_other_safetensors_are_refused(tmp_path):
         checkpoint.load(path)
 
 
+# --- models that ship ------------------------------------------------------------------------------------------------
+
+
 def test_shipped_models_load_and_are_small():
     shipped = checkpoint.shipped_models()
     assert checkpoint.DEFAULT_CHECKPOINT in shipped.values()
@@ -134,3 +223,30 @@ def test_shipped_models_load_and_are_small():
         assert content.name == name
         assert path.stat().st_size < 500_000
         assert path.with_suffix(".md").is_file(), "a shipped model needs a model card"
+
+
+def test_models_of_the_tables_load():
+    for name, path in checkpoint.table_models().items():
+        _, content = checkpoint.load_network(path)
+        assert content.name == name
+
+
+def test_model_is_found_by_name_or_path(saved):
+    path, _ = saved
+    name, shipped = next(iter(checkpoint.shipped_models().items()))
+    assert checkpoint.find_model(path) == path
+    assert checkpoint.find_model(str(path)) == path
+    assert checkpoint.find_model(name) == shipped
+    assert checkpoint.find_model(None) == checkpoint.DEFAULT_CHECKPOINT
+    with pytest.raises(CheckpointError, match=rf"nobody.*shipped models are .*{name}"):
+        checkpoint.find_model("nobody")
+
+
+def test_model_for_a_horizon_is_the_shortest_that_reaches(tmp_path, monkeypatch):
+    for name, config in {"near": ModelConfig(), "far": ModelConfig(dt_s=0.4)}.items():
+        checkpoint.save(tmp_path / f"{name}.safetensors", config, {}, {})
+    monkeypatch.setattr(checkpoint, "WEIGHTS_FOLDER", tmp_path)
+    wanted = {0.5: "near", 1.2: "near", 1.3: "far", 4.8: "far"}
+    assert {h: checkpoint.model_for_horizon(h).stem for h in wanted} == wanted
+    with pytest.raises(CheckpointError, match=r"5 s ahead; there are far \(4\.8 s\), near \(1\.2 s\)"):
+        checkpoint.model_for_horizon(5.0)

@@ -73,3 +73,15 @@ def test_wrong_shapes_are_named():
         metrics.ade(np.zeros((4, 3)), np.zeros((4, 3)))
     with pytest.raises(ValueError, match="4 and 3 steps"):
         metrics.fde(STRAIGHT, STRAIGHT[:3])
+
+
+def test_who_has_collided():
+    """Three walk abreast, 0.1 and 0.5 m apart, and the outer two swap at the last step; one comes late."""
+    paths = np.zeros((3, 2, 2))
+    paths[:, 0, 1] = [0.0, 0.1, 0.6]
+    paths[:, 1, 1] = [0.6, 0.1, 0.0]
+    there = np.ones((3, 2), bool)
+    assert metrics.collided(paths, there).tolist() == [[True, False], [True, True], [False, True]]
+    there[0, 0] = False
+    assert metrics.collided(paths, there).tolist() == [[False, False], [False, True], [False, True]]
+    assert not metrics.collided(paths[:1], there[:1]).any()

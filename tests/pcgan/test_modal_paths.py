@@ -91,3 +91,73 @@ def test_eps_grows_with_the_horizon():
 def test_no_pedestrians_give_no_paths():
     found = modal_paths(torch.zeros(0, 3, 6), torch.zeros(0, 3, 6, 2), 1.0)
     assert found.points.shape == (0, 6, 3, 2)
+
+
+# --- gradients -------------------------------------------------------------------------------------------------------
+
+
+def clear_mixtures(seed, A=2, P=3, K=4):
+    """Weights (A, P, K) and means (A, P, K, 2) whose clusters do not change within 0.2 m: pairs 0.4 m or 6 m apart."""
+    rng = np.random.default_rng(seed)
+    places = np.array([[0.0, 0], [0.4, 0], [6, 0], [6, 0.4]])[:K]
+    means = places + rng.uniform(-0.05, 0.05, (A, P, K, 2)) + 0.5 * np.arange(P)[:, None, None]
+    logits = rng.uniform(-0.4, 0.4, (A, P, K))
+    return torch.from_numpy(logits).requires_grad_(), torch.from_numpy(means).requires_grad_()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gradients_are_those_of_finite_differences(seed):
+    """Of every point and probability, by every weight and mean, while no mean changes its cluster."""
+    logits, means = clear_mixtures(seed)
+
+    def paths(logits, means):
+        found = modal_paths(logits.softmax(dim=-1), means, eps_m=1.0)
+        return found.points[:, :2], found.probabilities[:, :2]
+
+    assert (paths(logits, means)[1] > 0.1).all()  # two clusters each
+    assert torch.autograd.gradcheck(paths, (logits, means), eps=1e-6, atol=1e-7)
+
+
+def test_gradient_moves_only_what_is_on_the_path():
+    """A path of the first cluster pulls at its two members, by their weights; the other cluster's gets nothing."""
+    logits, means = clear_mixtures(0, A=1)
+    with torch.no_grad():
+        logits[..., :2] += 1  # the first cluster is the most probable
+    weights = logits.softmax(dim=-1)
+    modal_paths(weights, means, eps_m=1.0).points[0, 0, :, 0].sum().backward()
+    share = weights.detach()[0, :, :2] / weights.detach()[0, :, :2].sum(dim=-1, keepdim=True)
+    torch.testing.assert_close(means.grad[0, :, :2, 0], share)
+    assert not means.grad[..., 2:, :].any()
+    assert not means.grad[..., 1].any()
+
+
+def test_faint_component_gets_no_gradient():
+    means = torch.tensor([[[[0.0, 0], [0.3, 0], [0.1, 0]]]], requires_grad=True)
+    logits = torch.tensor([[[1.0, 1.0, -2.0]]], requires_grad=True)
+    weights = logits.softmax(dim=-1)
+    assert weights[0, 0, 2] < MIN_WEIGHT_SHARE / 3
+    modal_paths(weights, means, eps_m=1.0).points.sum().backward()
+    assert means.grad[0, 0, :, 0].tolist()[:2] == pytest.approx([1.5, 1.5])  # three paths, all the same one
+    assert not means.grad[0, 0, 2].any()
+
+
+def test_unused_slots_repeat_a_real_path_and_have_no_probability():
+    logits, means = clear_mixtures(1, A=3, K=3)
+    found = modal_paths(logits.softmax(dim=-1), means, eps_m=1.0)
+    assert ((found.probabilities > 0).sum(dim=1) == 2).all()
+    torch.testing.assert_close(found.probabilities.sum(dim=1), torch.ones(3).double())
+    real = [any(torch.equal(found.points[a, 2], found.points[a, k]) for k in (0, 1)) for a in range(3)]
+    assert real == [True] * 3
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**31), angle=st.floats(-3, 3))
+def test_turning_the_means_turns_the_paths(seed, angle):
+    rng = np.random.default_rng(seed)
+    weights = torch.from_numpy(rng.dirichlet(np.full(5, 0.7), (3, 4)))
+    means = torch.from_numpy(np.cumsum(rng.normal(0, 1, (3, 4, 5, 2)), axis=1))
+    c, s = np.cos(angle), np.sin(angle)
+    turn = torch.tensor([[c, s], [-s, c]], dtype=torch.float64)
+    still, turned = modal_paths(weights, means, 1.0), modal_paths(weights, means @ turn + 3, 1.0)
+    torch.testing.assert_close(turned.probabilities, still.probabilities)
+    torch.testing.assert_close(turned.points, still.points @ turn + 3)

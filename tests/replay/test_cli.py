@@ -16,7 +16,15 @@ from replay import cli
 from replay.log_reader import checksum
 from replay.simulator.sensor_suite import CLUSTERS_TOPIC, ODOMETRY_TOPIC
 
-COMMANDS = sorted(typer.main.get_command(cli.app).commands)
+
+def _leaves(command, name=()):
+    """Yields every command by the words that call it, groups such as `data` and what is in them."""
+    for word, part in getattr(command, "commands", {}).items():
+        yield (*name, word), part
+        yield from _leaves(part, (*name, word))
+
+
+COMMANDS = dict(sorted(_leaves(typer.main.get_command(cli.app))))
 
 
 def one_line(err):
@@ -38,16 +46,18 @@ def inline(pcgan, model):
 
 
 def test_the_commands():
-    assert {"replay", "simulate", "predict", "info", "train"} <= set(COMMANDS)
+    words = {name[0] for name in COMMANDS}
+    assert words == {"replay", "simulate", "predict", "info", "models", "train", "windows", "evaluate", "data"}
+    assert {("data", "list"), ("data", "get")} <= set(COMMANDS)
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_explains_itself_with_examples(pcgan, command):
-    outcome = pcgan(command, "--help")
+@pytest.mark.parametrize("name", COMMANDS, ids=" ".join)
+def test_every_command_explains_itself_with_examples(pcgan, name):
+    outcome = pcgan(*name, "--help")
     assert outcome.code == 0
     assert "Example" in outcome.out
-    assert f"pcgan {command}" in outcome.out.split("Example")[1]
-    for parameter in typer.main.get_command(cli.app).commands[command].params:
+    assert f"pcgan {' '.join(name)}" in outcome.out.split("Example")[1]
+    for parameter in COMMANDS[name].params:
         if not getattr(parameter, "hidden", False) and parameter.opts[0].startswith("--"):
             assert parameter.opts[0] in outcome.out
             assert parameter.help, parameter.name
@@ -56,8 +66,18 @@ def test_every_command_explains_itself_with_examples(pcgan, command):
 def test_pcgan_alone_lists_the_commands(pcgan):
     outcome = pcgan("--help")
     assert outcome.code == 0
-    for command in COMMANDS:
-        assert command in outcome.out
+    for name in COMMANDS:
+        assert f"│ {name[0]} " in outcome.out
+    for panel in ("Drives", "Models", "Data"):
+        assert f"─ {panel} ─" in outcome.out
+
+
+@pytest.mark.parametrize("name", COMMANDS, ids=" ".join)
+def test_examples_fit_a_terminal_of_80_columns(name):
+    """Help is markdown: a line that is too long would wrap in mid-command."""
+    for line in COMMANDS[name].help.splitlines():
+        if line.strip().startswith("pcgan "):
+            assert len(line.strip()) <= 78
 
 
 def test_an_option_nobody_knows_is_exit_2(pcgan):
@@ -352,6 +372,24 @@ def test_simulate_repeats_itself(pcgan, tmp_path):
     assert outcome.err == ""
     assert pcgan("simulate", tmp_path / "b.mcap", *arguments).code == 0
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_a_drive_through_a_trajectory_file(pcgan, tmp_path):
+    clip = tmp_path / "mine.csv"
+    header = "id,stamp_ns,x,y,vx,vy,vehicle_x,vehicle_y,vehicle_yaw,vehicle_speed"
+    rows = [f"1,{k * 10**8},{5 + 0.1 * k},2,1,0,{0.2 * k},0,0,2" for k in range(11)]
+    clip.write_text("\n".join([header, *rows]) + "\n")
+    outcome = pcgan("simulate", tmp_path / "out.mcap", "--clip", clip)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert outcome.out == f"{tmp_path / 'out.mcap'}: 1.0 s of mine.csv, 1 people, 10 scans\n"
+    clip.write_text(f"{header}\n1,0,5,2,1\n")
+    outcome = pcgan("simulate", tmp_path / "again.mcap", "--clip", clip)
+    assert outcome.code == 2
+    assert "mine.csv, row 1: 5 cells under 10 columns" in one_line(outcome.err)
+    outcome = pcgan("simulate", tmp_path / "again.mcap", "--clip", tmp_path / "gone.csv")
+    assert outcome.code == 2
+    assert "there is no file " in one_line(outcome.err)
+    assert not (tmp_path / "again.mcap").exists()
 
 
 @pytest.mark.parametrize("clip", ["dut/nowhere_99", "nonsense", "other/clip", "../../etc/passwd"])

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from replay.score import MATCH_M, Errors, ReplayScore
+from replay.score import MATCH_M, MAX_GAP_NS, Errors, Positions, ReplayScore, lookup
 from schemas.messages import ModalPath
 
 P = 3  # predicted steps, 0.1 s each, as far apart as the frames
@@ -211,3 +211,56 @@ def test_means_are_weighted_by_prediction():
     errors.add(np.array([[4.0, 5, 6, 7], [7, 8, 9, 10]]))
     assert errors.as_json() == {"ade_m": 4, "fde_m": 5, "mhd_m": 6, "nll": 7}
     assert errors.scored == 3
+
+
+# --- where people were at given times --------------------------------------------------------------------------------
+
+
+def at(stamp_ns, people, unmeasured=()):
+    """Positions of {id: (x, y)}."""
+    ids = np.array(sorted(people), np.int64)
+    positions = np.array([people[id] for id in ids], float).reshape(-1, 2)
+    return Positions(stamp_ns, ids, positions, ~np.isin(ids, unmeasured))
+
+
+def test_each_step_is_known_by_itself():
+    """Person 7 leaves after 200 ms: two steps of four are known; person 3 is there throughout, person 5 never was."""
+    seen = [at(k * 100, {3: (k, 0), **({7: (0, k)} if k <= 2 else {})}) for k in range(6)]
+    positions, known = lookup(seen, np.array([7, 3, 5]), np.array([50, 150, 250, 400]))
+    assert known.tolist() == [[True, True, False, False], [True] * 4, [False] * 4]
+    np.testing.assert_allclose(positions[0, :2], [[0, 0.5], [0, 1.5]])
+    np.testing.assert_allclose(positions[1], [[0.5, 0], [1.5, 0], [2.5, 0], [4, 0]])
+
+
+def test_steps_before_and_past_what_was_seen_are_not_known():
+    _, known = lookup([at(100, {1: (0, 0)}), at(200, {1: (1, 0)})], np.array([1]), np.array([50, 100, 200, 250]))
+    assert known.tolist() == [[False, True, True, False]]
+
+
+def test_a_step_in_a_long_gap_is_not_known():
+    half = MAX_GAP_NS // 2
+    seen = [at(0, {1: (0, 0)}), at(MAX_GAP_NS, {1: (1, 0)}), at(2 * MAX_GAP_NS + 1, {1: (2, 0)})]
+    positions, known = lookup(seen, np.array([1]), np.array([half, MAX_GAP_NS + half, 2 * MAX_GAP_NS + 1]))
+    assert known.tolist() == [[True, False, True]]
+    np.testing.assert_allclose(positions[0, [0, 2]], [[0.5, 0], [2, 0]])
+
+
+def test_what_was_not_measured_does_not_count():
+    seen = [at(0, {1: (0, 0)}), at(100, {1: (99, 0)}, unmeasured=[1]), at(200, {1: (2, 0)})]
+    positions, known = lookup(seen, np.array([1]), np.array([100]))
+    assert known.all()
+    np.testing.assert_allclose(positions, [[[1, 0]]])
+
+
+def test_everybody_may_be_asked_about_other_times():
+    seen = [at(k * 100, {1: (k, 0), 2: (0, k)}) for k in range(5)]
+    positions, known = lookup(seen, np.array([2, 1, 2]), np.array([[100], [250], [350]]))
+    assert known.all()
+    np.testing.assert_allclose(positions[:, 0], [[0, 1], [2.5, 0], [0, 3.5]])
+
+
+def test_nothing_seen_or_nobody_asked_about():
+    steps = np.array([100, 200])
+    for seen in ([], [at(0, {})]):
+        assert lookup(seen, np.array([1]), steps)[1].tolist() == [[False, False]]
+    assert lookup([at(0, {1: (0, 0)})], np.zeros(0, np.int64), steps)[1].shape == (0, 2)
