@@ -78,10 +78,10 @@ def find_model(name_or_path: str | Path | None) -> Path:
     """Returns the file of a shipped model or a file itself; None is the default. Raises CheckpointError for others."""
     if name_or_path is None:
         return DEFAULT_CHECKPOINT
-    shipped = shipped_models()
+    shipped, tables = shipped_models(), table_models()
     if (path := Path(name_or_path)).is_file():
         return path
-    if found := shipped.get(str(name_or_path)):
+    if found := (shipped | tables).get(str(name_or_path)):
         return found
     raise CheckpointError(f"no checkpoint {name_or_path}; shipped models are {sorted(shipped)}")
 

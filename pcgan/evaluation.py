@@ -113,8 +113,10 @@ def evaluate(
         for task in _tasks(name, drives or {}, data_dir)
         for method in METHODS[name]
         if method in methods or not methods
-        for path in _paths(folder, method, task, needed=method in methods)
+        for path in _paths(folder, method, task)
     ]
+    if missing := sorted(set(methods) - {method for _, method, _ in todo}):
+        raise CheckpointError(f"no networks of {', '.join(missing)} for {data} in {folder}")
     evaluation = Evaluation()
     parts: dict[tuple[str, str], list[Curves]] = {}
     pictured: dict[str, dict[str, Method]] = {}
@@ -248,10 +250,10 @@ def _clips_as_tracked(spec: WindowSpec, data_dir: Path | None) -> dict[str, Wind
     return {name: clip_windows(load_clip(name, data_dir), spec, VALIDATION_NOISE_M, rng) for name in names}
 
 
-def _paths(folder: Path, method: str, task: _Task, *, needed: bool) -> list[Path | None]:
+def _paths(folder: Path, method: str, task: _Task) -> list[Path | None]:
     """Returns a method's networks for a task, by seed; one without a seed in its name counts as the first.
 
-    What needs no network has None. The long tasks have fewer networks than the others.
+    What needs no network has None. Not every method has a network for every task.
     """
     if method in EXTRAPOLATIONS:
         return [None]
@@ -259,8 +261,6 @@ def _paths(folder: Path, method: str, task: _Task, *, needed: bool) -> list[Path
     if task.shipped is not None:
         stem, folder = task.shipped, folder.parent if folder == checkpoint.TABLE_WEIGHTS else folder
     found = [path for path in sorted(folder.glob(f"{stem}*.safetensors")) if _SEED.sub("", path.stem) == stem]
-    if not found and needed and not task.scene.endswith("_long"):  # PCGAN alone is trained for the long tasks
-        raise CheckpointError(f"no {stem}[_s0].safetensors in {folder}")
     return list(found)
 
 

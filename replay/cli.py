@@ -47,7 +47,7 @@ Model = Annotated[
 ]
 Horizon = Annotated[
     float | None,
-    typer.Option(min=0.1, metavar="S", help="Shipped weights that look this far ahead, or not much further."),
+    typer.Option(min=0.1, metavar="S", help="The shipped weights that look at least so far ahead."),
 ]
 Log = Annotated[list[Path], typer.Argument(metavar="LOG.mcap", help="The recording, in one file or several.")]
 Remaps = Annotated[

@@ -320,13 +320,13 @@ def _print_rows(rows: list[dict[str, Any]]) -> None:
             row["name"],
             row["method"],
             row["recipe"] or "",
-            f"{row['dt_s']:g}",
-            f"{row['horizon_s']:g}",
+            f"{row['dt_s']:.3g}",
+            f"{row['horizon_s']:.3g}",
             "yes" if row["uses_vehicle"] else "no",
             f"{row['size_bytes'] / 1000:.0f}",
             _purpose(row),
         )
-    console(minimum_width=100).print(table)
+    console(minimum_width=140).print(table)
 
 
 def _purpose(row: dict[str, Any]) -> str:
