@@ -64,6 +64,10 @@ def pcgan(capfd, monkeypatch):
     return run
 
 
+# A shell that runs the tests in the background has them ignore Ctrl-C, and children inherit that.
+_START = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from replay.cli import main; main()"
+
+
 @pytest.fixture
 def start_pcgan():
     """Starts the command as a process of its own (its own session, too); whatever still runs at the end is killed."""
@@ -71,7 +75,7 @@ def start_pcgan():
 
     def start(*arguments: object, **options) -> subprocess.Popen:
         process = subprocess.Popen(
-            [sys.executable, "-m", "replay.cli", *map(str, arguments)],
+            [sys.executable, "-c", _START, *map(str, arguments)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
