@@ -16,7 +16,7 @@ nothing (one scene) or S scenes padded to A pedestrians each, which `neighbours`
 """
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -27,6 +27,7 @@ from pcgan import mixture_density
 from pcgan.batches import Observation, begun
 from pcgan.mixture_density import RAW_PER_COMPONENT, GaussianMixture, mixture_from_raw
 from pcgan.modal_paths import cluster_eps_m
+from pcgan.network_config import check_sizes, config_from_dict
 
 RECIPES = ("paper", "best")
 POOLINGS = ("gvat", "social", "none")
@@ -56,17 +57,11 @@ class ModelConfig:
             raise ValueError(f"recipe must be one of {RECIPES}, got {self.recipe!r}")
         if self.pooling not in POOLINGS:
             raise ValueError(f"pooling must be one of {POOLINGS}, got {self.pooling!r}")
-        sizes = {name: value for name, value in asdict(self).items() if type(value) is int}
-        if small := {name: value for name, value in sizes.items() if value < 1}:
-            raise ValueError(f"sizes must be positive, got {small}")
-        if self.observed_steps < 2:
-            raise ValueError(f"observed_steps must be at least 2 for a displacement, got {self.observed_steps}")
+        check_sizes(self)
         if self.hidden % GVAT.HEADS:
             raise ValueError(f"hidden must be a multiple of {GVAT.HEADS}, got {self.hidden}")
         if self.components > 9:
             raise ValueError(f"components must be at most 9 (see modal_paths), got {self.components}")
-        if not (math.isfinite(self.dt_s) and self.dt_s > 0):
-            raise ValueError(f"dt_s must be positive, got {self.dt_s}")
 
     @property
     def horizon_s(self) -> float:
@@ -81,13 +76,7 @@ class ModelConfig:
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "ModelConfig":
         """Builds a config from `asdict`'s result; raises ValueError naming unknown, missing or mistyped fields."""
-        wanted = asdict(ModelConfig())
-        if unknown := sorted(values.keys() ^ wanted.keys()):
-            raise ValueError(f"model configuration differs in the fields {unknown}")
-        for name, default in wanted.items():
-            if type(values[name]) is not type(default):
-                raise ValueError(f"model configuration {name} is {values[name]!r}, not a {type(default).__name__}")
-        return ModelConfig(**values)
+        return config_from_dict(ModelConfig, values, "model")
 
 
 class PaperGVAT(nn.Module):

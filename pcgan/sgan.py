@@ -11,7 +11,7 @@ Letters as in `pcgan.model`, and N samples, Z numbers of noise, M units of the p
 """
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -23,6 +23,7 @@ from pcgan.dataset import Windows
 from pcgan.forecast import MIN_SIGMA_M, Forecast, mixture_of_samples
 from pcgan.mixture_density import log_likelihood
 from pcgan.modal_paths import ModalPaths
+from pcgan.network_config import check_sizes, config_from_dict
 
 SAMPLES = 20
 BANDWIDTH_FACTORS = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15)
@@ -46,29 +47,17 @@ class SganConfig:
     discriminator_hidden: int = 64
 
     def __post_init__(self) -> None:
-        sizes = {name: value for name, value in asdict(self).items() if type(value) is int}
-        if small := {name: value for name, value in sizes.items() if value < 1}:
-            raise ValueError(f"sizes must be positive, got {small}")
-        if self.observed_steps < 2:
-            raise ValueError(f"observed_steps must be at least 2 for a displacement, got {self.observed_steps}")
+        check_sizes(self)
         if self.noise_dim >= self.decoder_hidden:
             raise ValueError(
                 f"noise_dim must be below decoder_hidden, which it is part of, got {self.noise_dim} and "
                 f"{self.decoder_hidden}"
             )
-        if not (math.isfinite(self.dt_s) and self.dt_s > 0):
-            raise ValueError(f"dt_s must be positive, got {self.dt_s}")
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "SganConfig":
         """Builds a config from `asdict`'s result; raises ValueError naming unknown, missing or mistyped fields."""
-        wanted = asdict(SganConfig())
-        if unknown := sorted(values.keys() ^ wanted.keys()):
-            raise ValueError(f"Social GAN configuration differs in the fields {unknown}")
-        for name, default in wanted.items():
-            if type(values[name]) is not type(default):
-                raise ValueError(f"Social GAN configuration {name} is {values[name]!r}, not a {type(default).__name__}")
-        return SganConfig(**values)
+        return config_from_dict(SganConfig, values, "Social GAN")
 
 
 class PoolHidden(nn.Module):

@@ -18,7 +18,7 @@ Letters as in `pcgan.model`.
 """
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -28,6 +28,7 @@ from torch.nn import functional as F
 from pcgan.batches import Observation, batches
 from pcgan.dataset import Windows
 from pcgan.forecast import MIN_SIGMA_M, Forecast, certain_path
+from pcgan.network_config import check_sizes, config_from_dict
 
 NO_NEIGHBOUR = -1e9
 
@@ -45,26 +46,14 @@ class SrLstmConfig:
     neighbourhood_m: float = 10.0
 
     def __post_init__(self) -> None:
-        sizes = {name: value for name, value in asdict(self).items() if type(value) is int}
-        if small := {name: value for name, value in sizes.items() if value < 1}:
-            raise ValueError(f"sizes must be positive, got {small}")
-        if self.observed_steps < 2:
-            raise ValueError(f"observed_steps must be at least 2 for a displacement, got {self.observed_steps}")
-        for name in ("dt_s", "neighbourhood_m"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} must be positive, got {value}")
+        check_sizes(self)
+        if not (math.isfinite(self.neighbourhood_m) and self.neighbourhood_m > 0):
+            raise ValueError(f"neighbourhood_m must be positive, got {self.neighbourhood_m}")
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "SrLstmConfig":
         """Builds a config from `asdict`'s result; raises ValueError naming unknown, missing or mistyped fields."""
-        wanted = asdict(SrLstmConfig())
-        if unknown := sorted(values.keys() ^ wanted.keys()):
-            raise ValueError(f"SR-LSTM configuration differs in the fields {unknown}")
-        for name, default in wanted.items():
-            if type(values[name]) is not type(default):
-                raise ValueError(f"SR-LSTM configuration {name} is {values[name]!r}, not a {type(default).__name__}")
-        return SrLstmConfig(**values)
+        return config_from_dict(SrLstmConfig, values, "SR-LSTM")
 
 
 class StatesRefinement(nn.Module):
