@@ -5,7 +5,7 @@ history is the tracker's, taken exactly as the predictor takes it, and the futur
 """
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -65,15 +65,10 @@ def make_windows(
     ]
     scenes: dict[str, list[_Scene]] = {name: [] for name in tasks}
     clips: dict[str, list[str]] = {name: [] for name in tasks}
-    with tempfile.TemporaryDirectory(prefix="pcgan-windows-") as scratch:
-        for done, (clip_name, vehicle, seed) in enumerate(drives):
-            if progress is not None:
-                progress(done, len(drives))
-            log = Path(scratch) / "drive.mcap"
-            simulate(log, clip=clip_name, vehicle=vehicle, pedestrians=0, duration_s=None, seed=seed)
-            for name, found in _drive_scenes(log, tasks).items():
-                scenes[name] += found
-                clips[name] += [clip_name] * len(found)
+    for clip_name, tracked in _tracked(drives, tasks, progress):
+        for name, found in tracked.items():
+            scenes[name] += found
+            clips[name] += [clip_name] * len(found)
     counts = {}
     for name, task in tasks.items():
         found = scenes[name]
@@ -112,27 +107,38 @@ def held_out_windows(
     Raises DataNotFound if the clips are not on this machine.
     """
     parts: dict[str, list[Windows]] = {name: [] for name in tasks}
+    drives = [(clip, vehicle, seed) for clip, vehicle in HELD_OUT_DRIVES]
+    for _, tracked in _tracked(drives, tasks, progress):
+        for name, scenes in tracked.items():
+            counts = [len(scene.observed) for scene in scenes]
+            parts[name].append(
+                centred(
+                    observed=np.concatenate([scene.observed for scene in scenes]),
+                    seen=np.concatenate([scene.seen for scene in scenes]),
+                    velocity=np.concatenate([scene.velocity for scene in scenes]),
+                    future=np.concatenate([scene.future for scene in scenes]),
+                    vehicle=np.repeat(np.stack([scene.vehicle for scene in scenes]), counts, axis=0),
+                    scene=np.repeat(np.arange(len(scenes)), counts),
+                    annotated=np.zeros(sum(counts), bool),
+                    dt_s=tasks[name].dt_s,
+                )
+            )
+    return {name: concatenate(windows) for name, windows in parts.items()}
+
+
+def _tracked(
+    drives: Sequence[tuple[str, int | None, int]],
+    tasks: Mapping[str, Task],
+    progress: Callable[[int, int], None] | None,
+) -> Iterator[tuple[str, dict[str, list["_Scene"]]]]:
+    """Simulates and tracks drives (clip, vehicle, seed) in turn; yields each one's clip, and scenes by task."""
     with tempfile.TemporaryDirectory(prefix="pcgan-windows-") as scratch:
-        for done, (clip, vehicle) in enumerate(HELD_OUT_DRIVES):
+        for done, (clip, vehicle, seed) in enumerate(drives):
             if progress is not None:
-                progress(done, len(HELD_OUT_DRIVES))
+                progress(done, len(drives))
             log = Path(scratch) / "drive.mcap"
             simulate(log, clip=clip, vehicle=vehicle, pedestrians=0, duration_s=None, seed=seed)
-            for name, scenes in _drive_scenes(log, tasks).items():
-                counts = [len(scene.observed) for scene in scenes]
-                parts[name].append(
-                    centred(
-                        observed=np.concatenate([scene.observed for scene in scenes]),
-                        seen=np.concatenate([scene.seen for scene in scenes]),
-                        velocity=np.concatenate([scene.velocity for scene in scenes]),
-                        future=np.concatenate([scene.future for scene in scenes]),
-                        vehicle=np.repeat(np.stack([scene.vehicle for scene in scenes]), counts, axis=0),
-                        scene=np.repeat(np.arange(len(scenes)), counts),
-                        annotated=np.zeros(sum(counts), bool),
-                        dt_s=tasks[name].dt_s,
-                    )
-                )
-    return {name: concatenate(windows) for name, windows in parts.items()}
+            yield clip, _drive_scenes(log, tasks)
 
 
 class _Scene:
