@@ -9,15 +9,31 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 
-from replay import cli_data, cli_models
-from replay.cli_common import EXIT_ERROR, console, errors, fail, progress, refuse_unwritable, write_json
+from replay import cli_data, cli_inspect, cli_label, cli_models
+from replay.cli_common import (
+    DRIVES,
+    EXIT_ERROR,
+    EXIT_REFUSED,
+    Log,
+    Remaps,
+    Salvage,
+    SettingsFile,
+    TimeOffsets,
+    console,
+    errors,
+    fail,
+    progress,
+    read_settings,
+    refuse_unwritable,
+    remaps,
+    with_time_offsets,
+    write_json,
+)
 from replay.errors import ReplayError
 from replay.frame_result import FrameResult
 from replay.interrupts import Interrupted
 from replay.record import Summary, record, refuse_overwriting
-from replay.session import ReplaySettings
 
 app = typer.Typer(
     name="pcgan",
@@ -28,9 +44,6 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-EXIT_REFUSED = 3  # the run went through, but messages were refused or a damaged file lost some
-DRIVES = "Drives"  # a panel of the help
 
 
 class PredictorMode(StrEnum):
@@ -49,12 +62,6 @@ Horizon = Annotated[
     float | None,
     typer.Option(min=0.1, metavar="S", help="The shipped weights that look at least so far ahead."),
 ]
-Log = Annotated[list[Path], typer.Argument(metavar="LOG.mcap", help="The recording, in one file or several.")]
-Remaps = Annotated[
-    list[str] | None,
-    typer.Option("--topic", metavar="NAME:=NAME", help="Read a topic under another name, e.g. /vn100/odometry:=/odom."),
-]
-Salvage = Annotated[bool, typer.Option("--salvage", metavar="", help="Read every intact chunk of a damaged file.")]
 
 
 @app.command(rich_help_panel=DRIVES)
@@ -100,10 +107,8 @@ def replay(
     ] = False,
     salvage: Salvage = False,
     topic: Remaps = None,
-    settings_file: Annotated[
-        Path | None,
-        typer.Option("--settings", metavar="FILE", help="Settings as JSON, such as an output's settings.json."),
-    ] = None,
+    time_offset: TimeOffsets = None,
+    settings_file: SettingsFile = None,
 ) -> None:
     """Replay a drive: track its pedestrians, predict them, write the predictions.
 
@@ -137,10 +142,11 @@ def replay(
     if rrd and view:
         fail("--rrd and --view exclude each other: write the recording and open it with rerun, or watch now")
     output = output or logs[0].with_name(f"{logs[0].stem}.pcgan.mcap")
-    refuse_overwriting(logs, *(path for path in (rrd, picture, summary) if path is not None))
+    refuse_overwriting(logs, *(path for path in (output, rrd, picture, summary) if path is not None))
     refuse_unwritable(rrd, picture, summary)
-    given = {"start_s": start or None, "duration_s": duration, "topics": _remaps(topic) or None}
-    settings = _settings(settings_file).model_copy(update={k: v for k, v in given.items() if v is not None})
+    given = {"start_s": start or None, "duration_s": duration, "topics": remaps(topic) or None}
+    settings = read_settings(settings_file).model_copy(update={k: v for k, v in given.items() if v is not None})
+    settings = with_time_offsets(settings, time_offset)
     choice = PredictorChoice(predictor.value, _chosen(model, horizon), connect, zenoh_config, namespace)
     images = rrd is not None or view
     run = Replay(logs, settings, choice, window=window, rate=rate, strict=strict, salvage=salvage, images=images)
@@ -287,7 +293,7 @@ def info(
     """
     from replay.log_info import describe_log, print_info
 
-    description = describe_log(logs, _remaps(topic), salvage=salvage, seconds=seconds)
+    description = describe_log(logs, remaps(topic), salvage=salvage, seconds=seconds)
     if as_json:
         typer.echo(json.dumps(description, indent=2))
     else:
@@ -295,6 +301,8 @@ def info(
     raise typer.Exit(0 if description["usable"] else EXIT_ERROR)
 
 
+app.add_typer(cli_inspect.app)
+app.add_typer(cli_label.app)
 app.add_typer(cli_models.app)
 app.add_typer(cli_data.app, rich_help_panel="Data")
 
@@ -325,31 +333,6 @@ def _chosen(model: str | None, horizon_s: float | None) -> str | Path | None:
         return model_for_horizon(horizon_s)
     except CheckpointError as error:
         fail(str(error))
-
-
-def _remaps(options: list[str] | None) -> dict[str, str]:
-    """Reads NAME:=NAME options."""
-    remaps = {}
-    for option in options or ():
-        default, separator, name = option.partition(":=")
-        if not separator or not default or not name:
-            fail(f"--topic wants NAME:=NAME, for example /vn100/odometry:=/odom; got {option!r}")
-        remaps[default] = name
-    return remaps
-
-
-def _settings(path: Path | None) -> ReplaySettings:
-    """Reads settings from a JSON file; what it leaves out keeps its default."""
-    if path is None:
-        return ReplaySettings()
-    try:
-        return ReplaySettings.model_validate_json(path.read_bytes())
-    except OSError as error:
-        fail(f"{path} cannot be read: {error.strerror or error}")
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the file"
-        fail(f"{path} does not hold replay settings: {where}: {first['msg']}")
 
 
 def _exit_code(done: Summary) -> int:

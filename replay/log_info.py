@@ -34,8 +34,8 @@ def describe_log(
         problem = _refused(paths, remaps, salvage=salvage)
     except LogError as error:
         problem, role_of, missing = str(error), {}, []
-    timings = _timings(reader, seconds)
-    scans = next((timings[name][0] for name, role in role_of.items() if role == "lidar clusters"), None)
+    timed = timings(reader, seconds)
+    scans = next((timed[name][0] for name, role in role_of.items() if role == "lidar clusters"), None)
     duration_s = (reader.end_ns - reader.start_ns) / 1e9
     return {
         "files": [path.name for path in paths],
@@ -45,7 +45,7 @@ def describe_log(
         "problem": problem,
         "missing": missing,
         "salvage_losses": reader.losses.notes,
-        "topics": [_topic(channel, duration_s, role_of, timings, scans) for channel in reader.channels],
+        "topics": [_topic(channel, duration_s, role_of, timed, scans) for channel in reader.channels],
     }
 
 
@@ -113,7 +113,7 @@ def _topic(
     }
 
 
-def _timings(reader: LogReader, seconds: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def timings(reader: LogReader, seconds: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Returns stamps and delays (log time minus stamp), in ns, of each topic whose messages we can decode."""
     known = {channel.topic for channel in reader.channels if channel.schema_name in DECODERS}
     rows: dict[str, list[tuple[int, int]]] = defaultdict(list)

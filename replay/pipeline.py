@@ -12,6 +12,8 @@ from replay.remote_predictor import AskedPredictor
 from replay.stage_clock import StageClock
 from replay.time_sync import SyncedFrame
 from schemas.messages import PredictionFrame, TrackFrame, VehicleHistory
+from tracking.fusion import Candidate
+from tracking.label_report import LabelReport
 from tracking.measurements import Measurements
 from tracking.pipeline import TrackingSettings, TrackingStage
 from tracking.tracker import LateScanError
@@ -32,10 +34,7 @@ class FrameTracker:
     def step(self, frame: SyncedFrame, *, published: bool = True) -> tuple[Measurements, TrackFrame]:
         """Tracks one frame; unpublished ones, which warm the tracker up, have no sequence of their own."""
         sensors = frame.sensors
-        if frame.epoch != self._epoch:
-            self._stage = TrackingStage(self._settings, first_id=self._stage.next_id)  # no id ever means two people
-            self._vehicle.clear()
-            self._epoch = frame.epoch
+        self._enter_epoch(frame)
         self._vehicle.append((sensors.stamp_ns, frame.vehicle_state))
         while self._vehicle[0][0] < sensors.stamp_ns - HISTORY_NS:
             self._vehicle.popleft()
@@ -52,6 +51,21 @@ class FrameTracker:
         )
         self._sequence += published
         return result.measurements, tracks
+
+    def _enter_epoch(self, frame: SyncedFrame) -> None:
+        if frame.epoch != self._epoch:
+            self._stage = TrackingStage(self._settings, first_id=self._stage.next_id)  # no id ever means two people
+            self._vehicle.clear()
+            self._epoch = frame.epoch
+
+    def explain(self, frame: SyncedFrame) -> tuple[Candidate, ...]:
+        """Returns which boxes and clusters a `step` with this frame is going to compare, and which it will match."""
+        self._enter_epoch(frame)
+        return self._stage.explain(frame.sensors)
+
+    def labels(self) -> LabelReport:
+        """Returns what the tracker makes of every label after the latest frame, published or not."""
+        return self._stage.labels()
 
     def amend(self, frame: SyncedFrame) -> None:
         """Takes in a frame whose successors were tracked before it; raises LateScanError if it is too old for that."""
@@ -79,7 +93,7 @@ def run_pipeline(
     asked: deque[tuple[SyncedFrame, Measurements, TrackFrame, float]] = deque()
     for frame in frames:
         if frame.late:
-            _amend(tracker, frame, refusals)
+            amend(tracker, frame, refusals)
             continue
         with clock.measure("track"):
             measurements, tracks = tracker.step(frame, published=published(frame))
@@ -95,7 +109,8 @@ def run_pipeline(
         yield _answered(*asked.popleft(), predictor.answer(), clock)
 
 
-def _amend(tracker: FrameTracker, frame: SyncedFrame, refusals: Refusals) -> None:
+def amend(tracker: FrameTracker, frame: SyncedFrame, refusals: Refusals) -> None:
+    """Takes a late frame in; one that is too late even for that is refused."""
     try:
         tracker.amend(frame)
     except LateScanError:

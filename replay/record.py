@@ -134,13 +134,15 @@ def record(
 
 
 def refuse_overwriting(recordings: Sequence[Path], *outputs: Path) -> None:
-    """Raises OutputError if an output, or the part it is written as, is one of the recordings."""
+    """Raises OutputError if an output, or the part it is written as, is a recording, or if two outputs are one file."""
     for output in outputs:
         for written in (output, output.with_name(output.name + ".part")):
             if any(written.resolve() == path.resolve() for path in recordings):
                 raise OutputError(
                     f"{written} is the recording itself, which is never overwritten; choose another output"
                 )
+        if sum(output.resolve() == other.resolve() for other in outputs) > 1:
+            raise OutputError(f"{output} would be written twice, the second time over the first; choose another name")
 
 
 def _count(summary: Summary, result: FrameResult) -> None:

@@ -141,6 +141,11 @@ class RerunView:
 
     def show(self, result: FrameResult) -> None:
         """Draws one frame; it is found under its stamp and its sequence."""
+        self._draw(result)
+        self._columns.end_frame(result.tracks.stamp_ns, result.tracks.sequence)
+
+    def _draw(self, result: FrameResult) -> None:
+        """Draws all that a frame has, and leaves its rows open for more."""
         from replay import rerun_drawing as drawing
         from replay.rerun_layout import layout
 
@@ -167,7 +172,6 @@ class RerunView:
         drawing.draw_cameras(self._columns, result, tuple(self._cameras))
         drawing.draw_counts(self._columns, result)
         self._log_images(result)
-        self._columns.end_frame(result.tracks.stamp_ns, result.tracks.sequence)
 
     def _log_images(self, result: FrameResult) -> None:
         """Logs images one by one, encoded as they are, scaled to the calibration; none is logged twice."""

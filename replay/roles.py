@@ -26,6 +26,7 @@ class Roles:
 
 
 REQUIRED = ("lidar clusters", "vehicle pose")
+STAMPED = (*REQUIRED, "camera detections", "camera image")  # what is put together by its stamps
 
 
 def assign_roles(channels: Sequence[ChannelInfo], remaps: Mapping[str, str] | None = None) -> Roles:
@@ -69,6 +70,34 @@ def assign_roles(channels: Sequence[ChannelInfo], remaps: Mapping[str, str] | No
     optional = ("camera detections", "transforms", "static transforms")
     missing = tuple(topic.name for topic in topics.INPUTS if topic.role in optional and topic.name not in topic_of)
     return Roles(topic_of, cameras, missing)
+
+
+def time_offsets(roles: Roles, offsets_ms: Mapping[str, float]) -> dict[str, int]:
+    """Returns what is added to the stamps of each topic: name in this log -> ns.
+
+    A ground truth belongs to its scan, whose stamp it bears: it is shifted with the clusters, and never on its own.
+
+    Args:
+        roles: the topics in use.
+        offsets_ms: topic, by its name in the log or by its default name -> ms.
+
+    Raises LogError if a topic is not in use, has no stamp that counts, or is named twice.
+    """
+    may_have = {t.name: roles.topic_of[t.name] for t in topics.INPUTS if t.role in STAMPED and t.name in roles.topic_of}
+    offsets_ns: dict[str, int] = {}
+    for name, offset_ms in offsets_ms.items():
+        topic = name if name in may_have.values() else may_have.get(name)
+        if topic is None:
+            listed = _listed(sorted(may_have.values()))
+            raise LogError(f"{name} can have no time offset; topics with stamps that count are {listed}")
+        if topic in offsets_ns:
+            raise LogError(
+                f"{topic} has two time offsets, one under its name in the log and one under its default name"
+            )
+        offsets_ns[topic] = round(offset_ms * 1e6)
+    truth = roles.topic_of.get("/simulation/ground_truth")
+    scans = roles.topic_of["/velodyne/front/clusters"]
+    return offsets_ns | ({truth: offsets_ns[scans]} if truth is not None and scans in offsets_ns else {})
 
 
 def schemas_for(topic: Topic) -> list[str]:

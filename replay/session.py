@@ -17,7 +17,7 @@ from replay.log_reader import LogReader, RawMessage
 from replay.pacing import Pacer
 from replay.pipeline import FrameTracker, run_pipeline
 from replay.remote_predictor import AskedPredictor, InlinePredictor, RemotePredictor
-from replay.roles import assign_roles
+from replay.roles import assign_roles, time_offsets
 from replay.stage_clock import StageClock
 from replay.time_sync import DEFAULT_VEHICLE_FRAME, SyncedFrame, SyncSettings, TimeSync
 from replay.transform_tree import TransformTree
@@ -89,6 +89,7 @@ class Replay:
         self.clock = StageClock()
         self.reader = LogReader(paths, salvage=salvage)
         self.roles = assign_roles(self.reader.channels, self.settings.topics)
+        self.offsets_ns = time_offsets(self.roles, self.settings.sync.time_offset_ms)
         self.start_ns = self.reader.start_ns + round(self.settings.start_s * 1e9)
         self.end_ns = self.reader.end_ns + 1
         if self.settings.duration_s is not None:
@@ -162,7 +163,7 @@ class Replay:
 
     def frames(self) -> Iterator[SyncedFrame]:
         """Yields synchronised frames from 4 s before the start on."""
-        sync = TimeSync(self.roles.cameras, self.settings.sync, self.refusals)
+        sync = TimeSync(self.roles.cameras, self.settings.sync, self.refusals, self.offsets_ns)
         names = self._names(images=self._images)
         cameras = {name: _camera_of(default) for name, default in names.items()}
         from_ns = max(self.reader.start_ns, self.start_ns - WARM_UP_NS)

@@ -8,7 +8,8 @@ import heapq
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from types import MappingProxyType
+from typing import Annotated, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,10 @@ from tracking.sensor_frame import CameraFrame, SensorFrame
 
 DEFAULT_VEHICLE_FRAME = "base_link"  # of poses that do not name the frame they are of
 
+MAX_OFFSET_MS = 10_000.0
+
 Stamped = TypeVar("Stamped", CameraDetections, CompressedImage)
+OffsetMs = Annotated[float, Field(ge=-MAX_OFFSET_MS, le=MAX_OFFSET_MS, allow_inf_nan=False)]
 
 
 class SyncSettings(BaseModel):
@@ -45,6 +49,9 @@ class SyncSettings(BaseModel):
     )
     wait_ms: float = Field(
         default=300, ge=0, description="log time after which a scan is released whatever is still missing"
+    )
+    time_offset_ms: dict[str, OffsetMs] = Field(
+        default={}, description="topic, by its name in the log or its default name -> added to its messages' stamps"
     )
 
 
@@ -73,14 +80,22 @@ class _Camera:
 class TimeSync:
     """Collects messages by their default topic names and releases frames.
 
-    `push` and `flush` return the frames that became complete; refused messages go to `refusals`.
+    `push` and `flush` return the frames that became complete; refused messages go to `refusals`. `offsets_ns` (topic as
+    it is pushed -> ns) is added to the stamps of what is pushed: the frames carry the corrected stamps.
     """
 
-    def __init__(self, cameras: tuple[str, ...], settings: SyncSettings, refusals: Refusals):
+    def __init__(
+        self,
+        cameras: tuple[str, ...],
+        settings: SyncSettings,
+        refusals: Refusals,
+        offsets_ns: Mapping[str, int] = MappingProxyType({}),
+    ):
         self._settings = settings
         self._tolerance_ns = int(settings.camera_tolerance_ms * 1e6)
         self._wait_ns = int(settings.wait_ms * 1e6)
         self._refusals = refusals
+        self._offsets_ns = offsets_ns
         self._tree = TransformTree()
         self._models: dict[str, tuple[CameraModel, str]] = {}  # camera -> model, optical frame
         self._calibrations: dict[str, CameraCalibration] = {}
@@ -121,6 +136,7 @@ class TimeSync:
         if isinstance(message, Transform | CameraCalibration):
             self.take_static(topic, camera, message, self._refusals)
         else:
+            message = self._corrected(topic, message)
             stamp_ns: int = message.stamp_ns  # type: ignore[attr-defined]
             verdict = self._guard(topic).check(stamp_ns, log_time_ns)
             if verdict is Verdict.REFUSE:
@@ -138,6 +154,13 @@ class TimeSync:
     def flush(self) -> Iterator[SyncedFrame]:
         """Yields what is still waiting, at the end of the log or of an epoch."""
         yield from self._release(lambda *_: True)
+
+    def _corrected(self, topic: str, message: object) -> object:
+        """Returns the message with its topic's time offset added to its stamp."""
+        offset_ns = self._offsets_ns.get(topic, 0)
+        if offset_ns == 0:
+            return message
+        return replace(message, stamp_ns=message.stamp_ns + offset_ns)  # type: ignore[type-var,attr-defined]
 
     def _guard(self, topic: str) -> StampGuard:
         return self._guards.setdefault(topic, StampGuard(self._reference))

@@ -203,11 +203,19 @@ def settings_of(model, prefix=""):
             yield prefix + name, field.default
 
 
+def shown_default(value):
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, tuple | dict):
+        return ", ".join(value) or "none"
+    return f"{value:g}"
+
+
 def test_tracking_page_has_every_setting_with_its_default():
     table = rows(sections(DOCS / "tracking.md")["Settings"])
     documented = {code_of(row[0])[0]: row[1] for row in table if row[0].startswith("`")}
     wanted = dict([*settings_of(TrackingSettings), *settings_of(SyncSettings)])
-    shown = {name: ", ".join(v) if isinstance(v, tuple) else format(v, "g") for name, v in wanted.items()}
+    shown = {name: shown_default(value) for name, value in wanted.items()}
     assert documented == shown
     assert all(row[2] for row in table)
 

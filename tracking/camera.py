@@ -98,11 +98,11 @@ class CameraModel:
         y = ((pixels[..., 1] - self.cy) / self.fy).ravel()
         radius = np.hypot(x, y)
         if self.model == "equidistant":
-            theta = self._invert_radial(radius, self.max_theta_rad)
+            theta = self._invert_radial(radius)
             scale = np.divide(np.sin(theta), radius, out=np.zeros_like(radius), where=radius > 0)
             directions = np.stack([scale * x, scale * y, np.cos(theta)], axis=-1)
         else:
-            undistorted = self._invert_radial(radius, self.max_radius)
+            undistorted = self._invert_radial(radius)
             if self.distortion[2:4].any():  # tangential terms reach a little further: start just inside the limit
                 undistorted = np.where(np.isnan(undistorted), 0.95 * self.max_radius, undistorted)
             scale = np.divide(undistorted, radius, out=np.ones_like(radius), where=radius > 0)
@@ -118,16 +118,36 @@ class CameraModel:
         scaled: FloatArray = r * np.polyval(numerator, r2) / np.polyval(denominator, r2)
         return scaled
 
-    def _invert_radial(self, radius: FloatArray, limit: float) -> FloatArray:
-        """Bisects the growing part of the distortion; NaN where it never reaches the radius."""
-        high = np.full_like(radius, min(limit, 1e3))
-        reachable = self._radial(high) >= radius
-        low = np.zeros_like(radius)
-        for _ in range(64):
-            middle = (low + high) / 2
-            above = self._radial(middle) > radius
-            low, high = np.where(above, low, middle), np.where(above, middle, high)
-        return np.where(reachable, (low + high) / 2, np.nan)
+    def _invert_radial(self, radius: FloatArray) -> FloatArray:
+        """Inverts the growing part of the distortion; NaN where it never reaches the radius.
+
+        A table gives a bracket so narrow that the distortion is nearly straight in it and a few steps along its secant
+        are exact. Only right at the limit, where the distortion stands still, it is not: there the bracket is bisected.
+        """
+        samples, distorted = self._radial_table
+        reachable = radius <= distorted[-1]
+        right = np.minimum(np.maximum(np.searchsorted(distorted, radius), 1), len(samples) - 1)
+        low, high = samples[right - 1], samples[right]
+        slope = (high - low) / np.maximum(distorted[right] - distorted[right - 1], 1e-300)
+        found = low.copy()
+        for _ in range(5):
+            found = np.minimum(np.maximum(found - slope * (self._radial(found) - radius), low), high)
+        rest = np.flatnonzero(reachable & (np.abs(self._radial(found) - radius) > 1e-13 * (1 + radius)))
+        if len(rest):
+            low, high, wanted = low[rest], high[rest], radius[rest]
+            for _ in range(48):
+                middle = (low + high) / 2
+                above = self._radial(middle) > wanted
+                low, high = np.where(above, low, middle), np.where(above, middle, high)
+            found[rest] = (low + high) / 2
+        return np.where(reachable, found, np.nan)
+
+    @cached_property
+    def _radial_table(self) -> tuple[FloatArray, FloatArray]:
+        """Undistorted radii (angles, if equidistant) from 0 to the limit, and the distorted ones; both rise."""
+        angles = np.linspace(0.0, min(self.max_theta_rad, math.pi if self.model == "equidistant" else 1.57), 2048)
+        samples = angles if self.model == "equidistant" else np.minimum(np.tan(angles), self.max_radius * (1 - 1e-9))
+        return samples, self._radial(samples)
 
     def _remove_tangential(
         self, x: FloatArray, y: FloatArray, u: FloatArray, v: FloatArray

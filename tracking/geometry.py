@@ -93,3 +93,17 @@ def interpolate_pose(T0: FloatArray, T1: FloatArray, fraction: float) -> FloatAr
         q = (math.sin((1 - fraction) * angle) * q0 + math.sin(fraction * angle) * q1) / math.sin(angle)
     translation = T0[:3, 3] + fraction * (T1[:3, 3] - T0[:3, 3])
     return transform_matrix(translation, q)
+
+
+def ground_heights(map_from_vehicle: FloatArray, places_m: FloatArray, below_m: float = 0.0) -> FloatArray:
+    """Returns the height (N,) in m, target frame, of the vehicle's ground plane at places (N, 2) of that frame.
+
+    The plane is parallel to the vehicle's x and y axes and lies `below_m` under its origin. A vehicle on its side has
+    none: its own height stands for it.
+    """
+    up = map_from_vehicle[:3, 2]
+    origin = map_from_vehicle[:3, 3] - below_m * up
+    if up[2] < 0.5:
+        return np.full(len(places_m), origin[2])
+    heights: FloatArray = origin[2] - ((places_m - origin[:2]) @ up[:2]) / up[2]
+    return heights

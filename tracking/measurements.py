@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from schemas.messages import FloatArray, IntArray
+from schemas.messages import BoolArray, FloatArray, IntArray
 
+FARTHEST_M = 1e8  # more than any map's coordinates
 MIN_SIGMA_M = 0.05  # no LiDAR centroid is known better than this
 
 
@@ -27,9 +28,10 @@ class Measurements:
     covariances_m2: FloatArray  # (M, 2, 2)
     pedestrian_probability: FloatArray  # (M,)  from this scan alone, strictly between 0 and 1
     cluster_index: IntArray  # (M,)  row in the scan's LidarClusters; -1 without a cluster
+    gives_birth: BoolArray  # (M,)  whether it may be a new person: not if its place is too uncertain
     evidence: tuple[tuple[CameraEvidence, ...], ...] = ()  # (M,)  boxes behind each measurement
     refused: int = 0  # how many more there were, not finite or with an impossible covariance
-    refused_cluster_index: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # (refused,)
+    refused_cluster_index: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # those with a cluster
 
     def __len__(self) -> int:
         return len(self.positions_m)
@@ -37,7 +39,7 @@ class Measurements:
 
 def empty_measurements() -> Measurements:
     """Returns a scan in which nothing was measured."""
-    return Measurements(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, np.int64))
+    return Measurements(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, np.int64), np.zeros(0, bool))
 
 
 def make_measurements(
@@ -46,6 +48,7 @@ def make_measurements(
     pedestrian_probability: FloatArray | None = None,
     cluster_index: IntArray | None = None,
     evidence: Sequence[tuple[CameraEvidence, ...]] | None = None,
+    gives_birth: BoolArray | None = None,
 ) -> Measurements:
     """Returns checked and sorted measurements, so that results do not depend on the order clusters came in.
 
@@ -55,9 +58,10 @@ def make_measurements(
         pedestrian_probability: (M,); without it 0.5, which says nothing. Clipped to [0.001, 0.999].
         cluster_index: (M,); without it 0 to M - 1.
         evidence: M tuples; without it none.
+        gives_birth: (M,); without it all may be new people.
 
     Returns:
-        The measurements that are finite and whose covariance is positive definite; `refused` counts the others.
+        The measurements that are on earth and whose covariance is positive definite; `refused` counts the others.
 
     Raises:
         ValueError: shapes do not agree.
@@ -70,25 +74,29 @@ def make_measurements(
     covs = np.broadcast_to(covs, (M, 2, 2)) if covs.ndim == 2 and covs.shape == (2, 2) else covs.reshape(-1, 2, 2)
     probability = np.full(M, 0.5) if pedestrian_probability is None else np.asarray(pedestrian_probability, float)
     index = np.arange(M) if cluster_index is None else np.asarray(cluster_index, np.int64)
+    births = np.ones(M, bool) if gives_birth is None else np.asarray(gives_birth, bool)
     boxes = ((),) * M if evidence is None else tuple(evidence)
-    if not len(covs) == len(probability) == len(index) == len(boxes) == M:
+    if not len(covs) == len(probability) == len(index) == len(boxes) == len(births) == M:
         raise ValueError(
             f"{M} positions, {len(covs)} covariances, {len(probability)} probabilities, "
-            f"{len(index)} cluster indices and {len(boxes)} tuples of evidence do not go together"
+            f"{len(index)} cluster indices, {len(boxes)} tuples of evidence and {len(births)} permissions of birth "
+            "do not go together"
         )
     determinant = covs[:, 0, 0] * covs[:, 1, 1] - covs[:, 0, 1] * covs[:, 1, 0]
-    sound = np.isfinite(positions).all(axis=1) & np.isfinite(probability) & np.isfinite(determinant)
+    sound = (np.abs(positions) < FARTHEST_M).all(axis=1) & np.isfinite(probability) & np.isfinite(determinant)
     sound &= (covs[:, 0, 0] > 0) & (determinant > 0)
-    order = np.lexsort((index, covs[:, 0, 0], probability, positions[:, 1], positions[:, 0]))
+    ties = (index, births, covs[:, 0, 1], covs[:, 1, 1], covs[:, 0, 0], probability)
+    order = np.lexsort((*ties, positions[:, 1], positions[:, 0]))
     order = order[sound[order]]
     return Measurements(
         positions[order],
         floor_eigenvalues(covs[order], MIN_SIGMA_M**2),
         np.clip(probability[order], 0.001, 0.999),
         index[order],
+        births[order],
         tuple(boxes[row] for row in order),
         M - len(order),
-        np.sort(index[~sound]),
+        np.sort(index[~sound & (index >= 0)]),
     )
 
 

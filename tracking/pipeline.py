@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pydantic import BaseModel, ConfigDict
 
 from schemas.messages import Track
-from tracking.fusion import FusionParams, fuse
+from tracking.fusion import Candidate, FusionParams, explain, fuse
+from tracking.label_report import LabelReport
 from tracking.measurements import Measurements
 from tracking.sensor_frame import SensorFrame
 from tracking.tracker import Tracker, TrackerParams
@@ -62,6 +63,14 @@ class TrackingStage:
         measurements = self._fuse(frame)
         self._tracker.amend(measurements, frame.stamp_ns, detection_probability(frame, self.settings.visibility))
         return measurements
+
+    def explain(self, frame: SensorFrame) -> tuple[Candidate, ...]:
+        """Returns which boxes and clusters `step` is going to compare in this frame, and which it will match."""
+        return explain(frame, self._tracker.predicted(frame.stamp_ns), self.settings.fusion)
+
+    def labels(self) -> LabelReport:
+        """Returns what the tracker makes of every label after the latest frame, published or not."""
+        return self._tracker.labels()
 
     def _fuse(self, frame: SensorFrame) -> Measurements:
         return fuse(frame, self._tracker.predicted(frame.stamp_ns), self.settings.fusion)

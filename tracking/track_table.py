@@ -9,6 +9,8 @@ import numpy as np
 
 from schemas.messages import BoolArray, FloatArray, IntArray
 
+SCANS_OF_ONE_STAMP = 1 << 20  # spacing of born_index between scans that share a stamp
+
 
 @dataclass(frozen=True, eq=False)
 class Labels:
@@ -22,6 +24,7 @@ class Labels:
     existence: FloatArray  # (L,)  probability that there is such a person or thing
     hidden: FloatArray  # (L,)  probability that it is hidden from the sensors, if it exists
     class_log_odds: FloatArray  # (L,)  of being a pedestrian
+    measurement: IntArray  # (L,)  row of the latest scan's measurement that the label owns, or -1
 
     def __len__(self) -> int:
         return len(self.born_ns)
@@ -33,15 +36,18 @@ _COLUMNS = tuple(field.name for field in fields(Labels))
 def no_labels() -> Labels:
     """Returns an empty table."""
     i, f = np.zeros(0, np.int64), np.zeros(0)
-    return Labels(i, i, i, i, np.zeros(0, bool), f, f, f)
+    return Labels(i, i, i, i, np.zeros(0, bool), f, f, f, i)
 
 
-def new_labels(stamp_ns: int, index: IntArray, existence: FloatArray, class_log_odds: FloatArray) -> Labels:
-    """Returns rows for labels born at a scan, with one hit each."""
-    L = len(index)
+def new_labels(
+    stamp_ns: int, repeats: int, measurement: IntArray, existence: FloatArray, class_log_odds: FloatArray
+) -> Labels:
+    """Returns rows for labels born at a scan, with one hit each; `repeats` earlier scans had the same stamp."""
+    L = len(measurement)
+    index = measurement + repeats * SCANS_OF_ONE_STAMP
     stamps = np.full(L, stamp_ns, np.int64)
     hits, unconfirmed, hidden = np.ones(L, np.int64), np.zeros(L, bool), np.zeros(L)
-    return Labels(stamps, index, hits, stamps, unconfirmed, existence, hidden, class_log_odds)
+    return Labels(stamps, index, hits, stamps, unconfirmed, existence, hidden, class_log_odds, measurement)
 
 
 def append(labels: Labels, more: Labels) -> Labels:

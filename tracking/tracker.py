@@ -2,24 +2,23 @@
 
 import math
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from schemas.messages import FloatArray, Track, TrackHistory
+from schemas.messages import FloatArray, IntArray, Track, TrackHistory
 from tracking import gm_phd
-from tracking.gm_phd import FilterParams
+from tracking.clutter import ClutterEstimate, updated
+from tracking.gm_phd import DetectionProbability, FilterParams
+from tracking.label_report import LabelReport, Verdict, report, verdicts
 from tracking.measurements import Measurements, PredictedTracks, no_predicted_tracks
-from tracking.mixture_reduction import GaussianMixture, concatenate, empty_mixture, label_mass, select
+from tracking.mixture_reduction import GaussianMixture, empty_mixture, label_mass, select
 from tracking.motion_model import process_noise
 from tracking.track_table import History, Labels, append, extend, new_labels, no_history, no_labels, take
 
-DetectionProbability = Callable[[FloatArray], FloatArray] | float
 MAX_CLASS_LOG_ODDS = 5.0
 MAX_REMEMBERED_IDS = 10_000
-SCANS_OF_ONE_STAMP = 1 << 20  # spacing of born_index between scans that share a stamp
 
 
 class LateScanError(ValueError):
@@ -27,15 +26,11 @@ class LateScanError(ValueError):
 
 
 class TrackerParams(BaseModel):
-    """Settings of the tracker. The defaults were tuned on the tuning seeds of benchmarks/tracking."""
+    """Settings of the tracker. The defaults were tuned on the tuning seeds and drives of benchmarks/tracking."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     filter: FilterParams = FilterParams()
-    survival_s: float = Field(default=20.0, gt=0, description="mean time a person stays, where the sensors look")
-    survival_unseen_s: float = Field(
-        default=2.0, gt=0, description="and where they do not: without it ghosts never die"
-    )
     confirm_existence: float = Field(default=0.5, gt=0, lt=1)
     confirm_hits: int = Field(default=2, ge=1)
     publish_existence: float = Field(
@@ -46,15 +41,13 @@ class TrackerParams(BaseModel):
         default=0.3, ge=0, description="without a hit for longer, a track is marked as coasting"
     )
     history_s: float = Field(default=3.6, ge=0)
-    hide_per_s: float = Field(default=0.05, ge=0, description="rate at which visible people become hidden")
+    hide_per_s: float = Field(default=0.01, ge=0, description="rate at which visible people become hidden")
     show_per_s: float = Field(default=1.0, ge=0, description="rate at which hidden people become visible again")
-    class_memory_s: float = Field(default=2.0, gt=0, description="time constant of a track's class log-odds")
+    class_memory_s: float = Field(default=3.0, gt=0, description="time constant of a track's class log-odds")
     pedestrian_probability: float = Field(
         default=0.4, gt=0, lt=1, description="tracks at least this likely are pedestrians"
     )
-    birth_pedestrian_probability: float = Field(
-        default=0.03, ge=0, lt=1, description="measurements below give no birth"
-    )
+    clutter_memory_s: float = Field(default=2.0, gt=0, description="time constant of the count of false measurements")
     ring: int = Field(default=8, ge=1, description="how many scans back a late one can still be taken in")
 
 
@@ -64,14 +57,16 @@ class TrackerState:
 
     stamp_ns: int
     repeats: int  # how many scans just before had the same stamp
+    clutter: ClutterEstimate
     mixture: GaussianMixture  # sorted by label row, the heaviest component first
     labels: Labels
     history: History
 
 
-def initial_state(stamp_ns: int) -> TrackerState:
+def initial_state(stamp_ns: int, params: TrackerParams) -> TrackerState:
     """Returns what is known before the first scan, which has this stamp."""
-    return TrackerState(stamp_ns, -1, empty_mixture(), no_labels(), no_history())
+    clutter = ClutterEstimate(params.filter.clutter_per_m2, 0.0)
+    return TrackerState(stamp_ns, -1, clutter, empty_mixture(), no_labels(), no_history())
 
 
 def advance(
@@ -93,44 +88,41 @@ def advance(
     """
     dt_s, L = (stamp_ns - state.stamp_ns) * 1e-9, len(state.labels)
     repeats = state.repeats + 1 if stamp_ns == state.stamp_ns else 0
-    predicted = gm_phd.predict(state.mixture, dt_s, params.filter)
-    in_view = _probabilities(detection_probability, predicted.means[:, :2])
-    lifetime_s = np.where(in_view > 0, params.survival_s, params.survival_unseen_s)
-    predicted = replace(predicted, weights=predicted.weights * np.exp(-dt_s / lifetime_s))
     hidden = _predict_hidden(state.labels, dt_s, params)
-
-    label_probability = 1 / (1 + np.exp(-state.labels.class_log_odds))
-    p_detect = in_view * (1 - hidden[predicted.labels])
-    correction = gm_phd.correct(
-        predicted, measurements, p_detect=p_detect, label_probability=label_probability, params=params.filter
+    step = gm_phd.step(
+        state.mixture,
+        measurements,
+        dt_s,
+        detection_probability=detection_probability,
+        hidden=hidden,
+        pedestrian=1 / (1 + np.exp(-state.labels.class_log_odds)),
+        clutter_per_m2=state.clutter.per_m2,
+        params=params.filter,
     )
     labels = _update_labels(
-        state.labels, predicted, correction, measurements,
-        hidden=hidden, in_view=in_view, stamp_ns=stamp_ns, dt_s=dt_s, params=params,
-    )  # fmt: skip
-
-    newborn = np.flatnonzero(
-        (correction.births >= params.filter.prune_weight)
-        & (measurements.pedestrian_probability >= params.birth_pedestrian_probability)
+        state.labels, step, measurements, hidden=hidden, stamp_ns=stamp_ns, dt_s=dt_s, params=params
     )
-    births = gm_phd.birth(measurements, newborn, correction.births[newborn], L + np.arange(len(newborn)), params.filter)
-    labels = append(
-        labels,
-        new_labels(
-            stamp_ns,
-            newborn + repeats * SCANS_OF_ONE_STAMP,
-            births.weights,
-            _log_odds(measurements.pedestrian_probability[newborn]),
-        ),
+    births = step.correction.births[step.newborn]
+    log_odds = _log_odds(measurements.pedestrian_probability[step.newborn])
+    labels = append(labels, new_labels(stamp_ns, repeats, step.newborn, births, log_odds))
+    clutter = updated(
+        state.clutter,
+        measurements.positions_m,
+        _unexplained(step.correction, measurements),
+        dt_s,
+        prior=params.filter.clutter_per_m2,
+        memory_s=params.clutter_memory_s,
     )
-    mixture = gm_phd.reduce(concatenate(correction.mixture, births), params.filter)
-    return _settle(mixture, labels, state.history, old=L, stamp_ns=stamp_ns, repeats=repeats, params=params)
+    mixture, labels, history = _settle(step.mixture, labels, state.history, old=L, stamp_ns=stamp_ns, params=params)
+    return TrackerState(stamp_ns, repeats, clutter, mixture, labels, history)
 
 
-def _probabilities(detection_probability: DetectionProbability, positions_m: FloatArray) -> FloatArray:
-    if callable(detection_probability):
-        return np.minimum(np.maximum(detection_probability(positions_m), 0.0), 1.0)
-    return np.full(len(positions_m), float(detection_probability))
+def _unexplained(correction: gm_phd.Correction, measurements: Measurements) -> float:
+    """Returns how many measurements are nobody's, expected; those that could not be new people do not count."""
+    nobody = np.ones(len(measurements))
+    owner = np.flatnonzero(correction.measurement >= 0)
+    nobody[correction.measurement[owner]] -= correction.explained[owner]
+    return float(nobody[measurements.gives_birth].sum())
 
 
 def _log_odds(p: FloatArray) -> FloatArray:
@@ -149,24 +141,23 @@ def _predict_hidden(labels: Labels, dt_s: float, params: TrackerParams) -> Float
 
 def _update_labels(
     labels: Labels,
-    predicted: GaussianMixture,
-    correction: gm_phd.Correction,
+    step: gm_phd.Step,
     measurements: Measurements,
     *,
     hidden: FloatArray,
-    in_view: FloatArray,
     stamp_ns: int,
     dt_s: float,
     params: TrackerParams,
 ) -> Labels:
     """Bayes' rule per label for existence (a Bernoulli's), for being hidden, and for being a pedestrian."""
     L = len(labels)
-    explained = correction.explained
+    predicted, correction, explained = step.predicted, step.correction, step.correction.explained
     prior = np.minimum(label_mass(predicted, L), 1.0)
     absent = np.maximum(1 - prior, 1e-12)
     existence = 1 - absent / (absent + correction.missed_mass + explained / (1 - explained))
 
-    visible = np.bincount(predicted.labels, predicted.weights * in_view, L) / np.maximum(prior, 1e-300)
+    visible = np.bincount(predicted.labels, predicted.weights * step.in_view, L) / np.maximum(prior, 1e-300)
+    visible = visible * (1 - correction.unresolved)
     unseen = hidden + (1 - hidden) * np.maximum(1 - visible, 0.0)
     hidden = (1 - explained) * np.divide(hidden, unseen, out=np.zeros(L), where=unseen > 0)
 
@@ -184,6 +175,7 @@ def _update_labels(
         existence=existence,
         hidden=hidden,
         class_log_odds=log_odds,
+        measurement=np.where(hit, correction.measurement, -1),
     )
 
 
@@ -194,9 +186,8 @@ def _settle(
     *,
     old: int,
     stamp_ns: int,
-    repeats: int,
     params: TrackerParams,
-) -> TrackerState:
+) -> tuple[GaussianMixture, Labels, History]:
     """Forgets dead labels, sets each living one's mass to its existence (it is one person at most), writes history."""
     mass = label_mass(mixture, len(labels))
     least = np.where(labels.confirmed, params.drop_existence, params.filter.prune_weight)
@@ -216,7 +207,7 @@ def _settle(
         labels.last_hit_ns != stamp_ns,
         span_ns=round(params.history_s * 1e9),
     )
-    return TrackerState(stamp_ns, repeats, mixture, labels, history)
+    return mixture, labels, history
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,6 +218,15 @@ class _Scan:
     stamp_ns: int
     detection_probability: DetectionProbability
     state: TrackerState
+
+
+def _names(labels: Labels) -> list[tuple[int, int]]:
+    return list(zip(labels.born_ns.tolist(), labels.born_index.tolist(), strict=True))
+
+
+def _owned(labels: Labels) -> dict[tuple[int, int], int]:
+    """Returns which measurement each label owns, or -1, by its name."""
+    return dict(zip(_names(labels), labels.measurement.tolist(), strict=True))
 
 
 class Tracker:
@@ -268,7 +268,7 @@ class Tracker:
             LateScanError: the stamp is before the last scan's; see `amend`.
         """
         self.check_in_order(stamp_ns)
-        state = self.state or initial_state(stamp_ns)
+        state = self.state or initial_state(stamp_ns, self.params)
         state = advance(state, measurements, stamp_ns, detection_probability, self.params)
         self._ring.append(_Scan(measurements, stamp_ns, detection_probability, state))
         return self._publish(state)
@@ -293,7 +293,27 @@ class Tracker:
         for scan in (late, *scans[before:]):
             state = advance(state, scan.measurements, scan.stamp_ns, scan.detection_probability, self.params)
             kept.append(replace(scan, state=state))
+        self._hand_on_ids(scans[before:], kept[before + 1 :])
         self._ring.extend(kept[-self.params.ring :])
+
+    def _hand_on_ids(self, old: list[_Scan], new: list[_Scan]) -> None:
+        """Gives a label whose birth the late scan has moved the id of what it was before.
+
+        It is the same one if it owns, in the latest scan in which the old one owned any, the same measurement.
+        """
+        if not old:
+            return
+        alive = set(_names(new[-1].state.labels))
+        gone = [name for name in _names(old[-1].state.labels) if name in self._ids and name not in alive]
+        for name in gone:
+            for before, after in zip(reversed(old), reversed(new), strict=True):
+                measurement = _owned(before.state.labels).get(name, -1)
+                if measurement >= 0:
+                    owners = [other for other, owned in _owned(after.state.labels).items() if owned == measurement]
+                    heir = next((other for other in owners if other in alive and other not in self._ids), None)
+                    if heir is not None:
+                        self._ids[heir] = self._ids.pop(name)
+                    break
 
     def predicted(self, stamp_ns: int) -> PredictedTracks:
         """Returns where every label with two hits is expected at a stamp, which may lie a little in the past."""
@@ -309,34 +329,34 @@ class Tracker:
         covs = covs[:, :2, :2] + dt_s * (cross + cross.swapaxes(1, 2)) + dt_s**2 * covs[:, 2:, 2:] + Q[:2, :2]
         return PredictedTracks(means[:, :2] + dt_s * means[:, 2:], means[:, 2:], covs)
 
+    def labels(self) -> LabelReport:
+        """Returns what is thought of every label after the latest scan, and why it is published or not."""
+        state = self.state or initial_state(0, self.params)
+        return report(state.labels, state.mixture, self._verdicts(state.labels), lambda name: self._ids.get(name, 0))
+
+    def _verdicts(self, labels: Labels) -> IntArray:
+        return verdicts(
+            labels,
+            publish_existence=self.params.publish_existence,
+            pedestrian_probability=self.params.pedestrian_probability,
+        )
+
     def _publish(self, state: TrackerState) -> tuple[Track, ...]:
         labels, history, params = state.labels, state.history, self.params
-        threshold = math.log(params.pedestrian_probability / (1 - params.pedestrian_probability))
-        shown = labels.confirmed & (labels.existence >= params.publish_existence)
-        rows = np.flatnonzero(shown & (labels.class_log_odds >= threshold))
+        rows = np.flatnonzero(self._verdicts(labels) == Verdict.PUBLISHED)
         heaviest = np.searchsorted(state.mixture.labels, rows)
         means, covs = state.mixture.means[heaviest], state.mixture.covs[heaviest]
-        first = np.searchsorted(history.stamps_ns, labels.born_ns[rows]).tolist()
-        born_ns, born_index = labels.born_ns[rows].tolist(), labels.born_index[rows].tolist()
-        existence = np.minimum(np.maximum(labels.existence[rows], 0.0), 1.0).tolist()
-        unseen_ns = (state.stamp_ns - labels.last_hit_ns[rows]).tolist()
-        coasting_after_ns = round(params.coasting_after_s * 1e9)
-        tracks = []
-        for i, row in enumerate(rows.tolist()):
-            start = first[i]
-            past = TrackHistory(history.stamps_ns[start:], history.states[row, start:], history.coasting[row, start:])
-            tracks.append(
-                Track(
-                    self._id((born_ns[i], born_index[i])),
-                    means[i],
-                    covs[i],
-                    existence[i],
-                    state.stamp_ns - born_ns[i],
-                    unseen_ns[i] > coasting_after_ns,
-                    past,
-                )
-            )
-        return tuple(tracks)
+        shown = take(labels, rows)
+        first = np.searchsorted(history.stamps_ns, shown.born_ns).tolist()
+        pasts = [
+            TrackHistory(history.stamps_ns[start:], states[start:], coasting[start:])
+            for start, states, coasting in zip(first, history.states[rows], history.coasting[rows], strict=True)
+        ]
+        existence = np.minimum(np.maximum(shown.existence, 0.0), 1.0).tolist()
+        ages_ns = (state.stamp_ns - shown.born_ns).tolist()
+        coasting = (state.stamp_ns - shown.last_hit_ns > round(params.coasting_after_s * 1e9)).tolist()
+        columns = zip(_names(shown), means, covs, existence, ages_ns, coasting, pasts, strict=True)
+        return tuple(Track(self._id(name), *column) for name, *column in columns)
 
     def _id(self, name: tuple[int, int]) -> int:
         number = self._ids.get(name)
@@ -349,8 +369,5 @@ class Tracker:
 
     def _forget_ids(self) -> None:
         """Drops the numbers of labels that no remembered state holds."""
-        states = [scan.state.labels for scan in self._ring]
-        alive = {
-            name for labels in states for name in zip(labels.born_ns.tolist(), labels.born_index.tolist(), strict=True)
-        }
+        alive = {name for scan in self._ring for name in _names(scan.state.labels)}
         self._ids = {name: number for name, number in self._ids.items() if name in alive}

@@ -1,11 +1,13 @@
 """How likely the LiDAR is to see a person somewhere: range, and what stands in between."""
 
 from collections.abc import Callable
+from typing import Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from schemas.messages import FloatArray
+from tracking.clusters import sound_clusters
 from tracking.geometry import apply
 from tracking.sensor_frame import SensorFrame
 
@@ -16,12 +18,18 @@ class VisibilityParams(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     p_detect: float = Field(default=0.95, gt=0, lt=1, description="of a person in plain view, nearby")
-    p_detect_hidden: float = Field(default=0.1, gt=0, lt=1, description="of one hidden behind something nearer")
+    p_detect_hidden: float = Field(default=0.3, gt=0, lt=1, description="of one hidden behind something nearer")
     full_range_m: float = Field(default=30.0, gt=0, description="up to here nothing is lost to distance")
     max_range_m: float = Field(default=55.0, gt=0, description="from here on nobody is seen: outside the view")
     person_radius_m: float = Field(default=0.25, gt=0)
-    nearer_by_m: float = Field(default=0.5, gt=0, description="an object must be this much nearer to hide a person")
+    nearer_by_m: float = Field(default=0.35, gt=0, description="an object must be this much nearer to hide a person")
     hiding_height_m: float = Field(default=1.2, gt=0, description="an object this tall hides a person altogether")
+
+    @model_validator(mode="after")
+    def _falls(self) -> Self:
+        if self.max_range_m <= self.full_range_m:
+            raise ValueError(f"max_range_m {self.max_range_m:g} must be over full_range_m {self.full_range_m:g}")
+        return self
 
 
 def hidden_share(
@@ -64,7 +72,7 @@ def detection_probability(frame: SensorFrame, params: VisibilityParams) -> Calla
     """
     origin = frame.map_from_lidar[:2, 3]
     clusters = frame.clusters
-    sound = np.isfinite(clusters.centroids_m).all(axis=1) & np.isfinite(clusters.sizes_m).all(axis=1)
+    sound = sound_clusters(frame)
     sizes = clusters.sizes_m[sound]
     occluders = apply(frame.map_from_lidar, clusters.centroids_m[sound])[:, :2] - origin
     radii = 0.5 * np.maximum(sizes[:, 0], sizes[:, 1])

@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -13,7 +13,9 @@ import pytest
 
 from replay import PredictorChoice, Replay, cli, record
 from replay.frame_result import FrameResult
+from replay.simulator.sensor_suite import CLUSTERS_TOPIC, GROUND_TRUTH_TOPIC, ODOMETRY_TOPIC
 from schemas import codec
+from schemas import pcgan_v1_pb2 as pb
 from schemas.messages import (
     CameraCalibration,
     CameraDetections,
@@ -91,6 +93,22 @@ def start_pcgan():
         if process.poll() is None:
             process.kill()
         process.communicate()
+
+
+@pytest.fixture(scope="session")
+def shift_stamps():
+    """Returns a change for `edit_log`: the stamps of some topics are off by so many ms, their log times are not."""
+    kinds = {CLUSTERS_TOPIC: pb.LidarClusters, GROUND_TRUTH_TOPIC: pb.GroundTruthFrame, ODOMETRY_TOPIC: pb.VehiclePose}
+
+    def change(offset_ms: float, *topics: str) -> Callable:
+        def shifted(topic: str, data: bytes) -> bytes:
+            message = kinds.get(topic, pb.CameraDetections).FromString(data)
+            message.stamp_ns += round(offset_ms * MS)
+            return message.SerializeToString(deterministic=True)
+
+        return lambda log: [(topic, at, shifted(topic, data) if topic in topics else data) for topic, at, data in log]
+
+    return change
 
 
 @pytest.fixture(scope="session")

@@ -47,7 +47,8 @@ def inline(pcgan, model):
 
 def test_the_commands():
     words = {name[0] for name in COMMANDS}
-    assert words == {"replay", "simulate", "predict", "info", "models", "train", "windows", "evaluate", "data"}
+    drives = {"replay", "simulate", "predict", "info", "inspect", "label"}
+    assert words == drives | {"models", "train", "windows", "evaluate", "data"}
     assert {("data", "list"), ("data", "get")} <= set(COMMANDS)
 
 

@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
+from replay import PredictorChoice, Replay, ReplaySettings
 from replay.errors import LogError, Refusals
+from replay.roles import Roles, time_offsets
 from replay.time_sync import SyncSettings, TimeSync
 
 SCANS, POSES, BOXES = "/velodyne/front/clusters", "/vn100/odometry", "/gmsl/{}/detections"
@@ -409,3 +412,70 @@ def test_a_transform_in_the_stream_is_taken(rig, make):
     r.poses(*range(900, 1100, 10))
     r.scan(1000)
     assert released(r).sensors.stamp_ns == make.stamp(1000)
+
+
+# --- time offsets ----------------------------------------------------------------------------------------------------
+
+
+def test_an_offset_is_added_to_a_topic_s_stamps(make):
+    """A camera whose clock is 80 ms ahead: with -80 ms its boxes are those of the scan again, at the vehicle's pose."""
+    r = Rig(make)
+    r.sync = TimeSync(("A0",), SyncSettings(), r.refusals, {BOXES.format("A0"): -80 * make.MS})
+    r.sync.take_static("/gmsl/A0/camera_info", "A0", make.calibration(), r.refusals)
+    for name in ("lidar", "camera"):
+        r.sync.take_static("/tf_static", None, make.transform("base_link", name, (1.2, 0, 1.4)), r.refusals)
+    r.poses(*range(900, 1100, 10))
+    r.boxes(1000)
+    r.boxes(1110)
+    r.scan(1000)
+    (camera,) = released(r).sensors.cameras
+    assert camera.detections.stamp_ns == make.stamp(1030)
+    np.testing.assert_allclose(np.linalg.inv(camera.camera_from_map)[:3, 3], [3.26, 0, 1.4], atol=1e-9)
+
+
+def test_frames_bear_the_corrected_stamp_of_the_scan_and_keep_its_truth(make):
+    r = Rig(make, ())
+    offsets_ns = {SCANS: -50 * make.MS, "/simulation/ground_truth": -50 * make.MS}
+    r.sync = TimeSync((), SyncSettings(), r.refusals, offsets_ns)
+    r.sync.take_static("/tf_static", None, make.transform("base_link", "lidar"), r.refusals)
+    r.poses(*range(900, 1100, 10))
+    r.truth(1000)
+    r.scan(1000)
+    frame = released(r, 950)
+    assert frame.ground_truth.stamp_ns == make.stamp(950)
+    np.testing.assert_allclose(frame.vehicle_state[0], 1.9, atol=1e-9)
+
+
+@pytest.mark.parametrize("offset_ms", [float("nan"), float("inf"), 10_000.1, -10_000.1])
+def test_an_offset_that_makes_no_sense_is_refused(offset_ms):
+    with pytest.raises(ValidationError):
+        SyncSettings(time_offset_ms={SCANS: offset_ms})
+    assert SyncSettings(time_offset_ms={SCANS: 10_000}).time_offset_ms == {SCANS: 10_000}
+
+
+def test_offsets_go_by_the_name_in_the_log_or_by_the_default_name():
+    truth = "/simulation/ground_truth"
+    roles = Roles({SCANS: "/clusters", POSES: POSES, truth: "/truth", "/tf_static": "/tf_static"}, (), ())
+    shifted = {"/clusters": -5_000_000, "/truth": -5_000_000}  # a ground truth belongs to its scan
+    assert time_offsets(roles, {"/clusters": -5}) == shifted
+    assert time_offsets(roles, {SCANS: -5}) == shifted
+    assert time_offsets(roles, {POSES: 0.25}) == {POSES: 250_000}
+    assert time_offsets(roles, {}) == {}
+    for name in ("/nothing", "/tf_static", truth, "/truth"):
+        with pytest.raises(LogError, match=f"{name} can have no time offset; topics with stamps that count are /clus"):
+            time_offsets(roles, {name: 1})
+    with pytest.raises(LogError, match="/clusters has two time offsets"):
+        time_offsets(roles, {SCANS: 1, "/clusters": 2})
+
+
+@pytest.mark.parametrize("late", [("/gmsl/A1/detections",), (SCANS, "/simulation/ground_truth")], ids=["A1", "LiDAR"])
+def test_an_offset_undoes_wrong_stamps_to_the_last_bit(drive, model, edit_log, shift_stamps, digest, results, late):
+    path = edit_log(drive, shift_stamps(80, *late))
+    for offsets_ms, mended in (({late[0]: -80}, True), ({}, False)):
+        run = Replay(
+            [path], ReplaySettings(sync=SyncSettings(time_offset_ms=offsets_ms)), PredictorChoice("inline", model)
+        )
+        with run:
+            found = list(run)
+        assert (digest(found) == digest(results)) is mended
+        assert all(result.ground_truth is not None for result in found)

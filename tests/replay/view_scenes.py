@@ -86,6 +86,7 @@ def frame_at(index: int, motion: tuple[np.ndarray, ...], rng: np.random.Generato
         covariances_m2=np.broadcast_to(np.eye(2) * 0.01, (len(places), 2, 2)),
         pedestrian_probability=probability,
         cluster_index=np.arange(len(places)),
+        gives_birth=np.ones(len(places), bool),
     )
     sensors = SensorFrame(
         stamp_ns, clusters, map_from_lidar, map_from_vehicle,

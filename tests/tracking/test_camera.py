@@ -155,3 +155,17 @@ def test_the_view_ends_at_the_corner_farthest_from_the_centre(model, D):
 def test_a_view_wider_than_the_distortion_allows_ends_with_it():
     camera = CameraModel(2000, 2000, 300, 300, 1000, 1000, "plumb_bob", np.array([-0.3, 0.0, 0.0, 0.0]))
     assert camera.view_rad == camera.max_theta_rad
+
+
+def test_random_rational_lenses_can_be_inverted():
+    """Also those whose distortion ends at a pole."""
+    generator = np.random.default_rng(0)
+    for _ in range(200):
+        distortion = generator.uniform(-0.6, 0.6, 8) * [1, 1, 0, 0, 1, 1, 1, 1]
+        camera = CameraModel(640, 480, 500.0, 500.0, 320.0, 240.0, "rational_polynomial", distortion)
+        far = min(camera.max_radius, 1.0)
+        points = np.array([[0.3 * far, 0.2 * far, 1.0], [-0.5 * far, 0.1 * far, 1.0], [0.01, 0.0, 1.0]])
+        pixels, valid = camera.project(points)
+        rays = camera.ray(pixels[valid])
+        np.testing.assert_allclose(rays[:, :2] / rays[:, 2:], points[valid, :2], atol=1e-6)
+        assert valid.any()

@@ -7,8 +7,8 @@ import pytest
 
 from schemas.messages import CameraDetections, LidarClusters
 from tracking.camera import CameraModel
-from tracking.fusion import FusionParams, fuse
-from tracking.geometry import transform_matrix
+from tracking.fusion import FusionParams, explain, fuse
+from tracking.geometry import inverse, transform_matrix
 from tracking.measurements import PredictedTracks, no_predicted_tracks
 from tracking.sensor_frame import CameraFrame, SensorFrame
 
@@ -118,7 +118,7 @@ def test_a_box_of_the_wrong_height_is_no_match(world):
         frame.clusters, centroids_m=frame.clusters.centroids_m[1:], sizes_m=frame.clusters.sizes_m[1:],
         points=frame.clusters.points[1:],
     ))  # fmt: skip
-    scan = fuse(frame, NOBODY, PARAMS)
+    scan = fuse(frame, NOBODY, PARAMS.model_copy(update={"camera_only": False}))
     assert scan.evidence == ((),)
     assert scan.pedestrian_probability[0] < 0.35
 
@@ -182,7 +182,7 @@ def test_clusters_that_are_not_numbers_are_refused_and_counted(world):
     centroids[0, 2], sizes[1, 0], sizes[3, 1] = np.nan, np.inf, -1
     bad = replace(frame, clusters=replace(frame.clusters, centroids_m=centroids, sizes_m=sizes))
     scan = fuse(bad, NOBODY, PARAMS)
-    assert scan.cluster_index.tolist() == [2]
+    assert scan.cluster_index[scan.cluster_index >= 0].tolist() == [2]
     assert scan.refused == 3
     assert scan.refused_cluster_index.tolist() == [0, 1, 3]
 
@@ -259,3 +259,85 @@ def test_on_a_slope(world):
     # Rendered on flat ground at z = 0, the pose tilts only the sensors: clusters contradict the vehicle's plane.
     scan = fuse(world.frame(people, map_from_vehicle=pose), NOBODY, PARAMS)
     assert all(scan.evidence)
+
+
+def test_explain_tells_what_fuse_matched(world):
+    frame = world.frame([[5.0, 0], [11, 0.2], [8, 5.5], [-7, 2], [6, 5.7]], seed=2)
+    scan, candidates = fuse(frame, NOBODY, PARAMS), explain(frame, NOBODY, PARAMS)
+    matched = {(c.camera, c.box, c.cluster) for c in candidates if c.matched}
+    evidence = {
+        (e.camera, e.box, int(cluster))
+        for cluster, boxes in zip(scan.cluster_index, scan.evidence, strict=True)
+        for e in boxes
+        if cluster >= 0
+    }
+    assert matched == evidence != set()
+    assert all(c.likeness > 0 for c in candidates if c.matched)
+    assert any(not c.matched for c in candidates)
+
+
+def test_explain_tells_which_gate_refused_a_box(world):
+    """A far person's box over a near pole: too small for it."""
+    frame = world.frame([[20.0, 0]], poles_m=[[5, 0.0]])
+    (far,) = (c for c in explain(frame, NOBODY, PARAMS) if c.cluster == 0)
+    (near,) = (c for c in explain(frame, NOBODY, PARAMS) if c.cluster == 1)
+    assert far.matched
+    assert near.likeness == 0
+    assert not near.matched
+    assert near.height_log_ratio < -PARAMS.max_height_log_ratio
+
+
+def test_a_half_hidden_person_without_a_box_is_ruled_out_less_than_one_in_plain_view(world):
+    """Somebody stands half behind another, as seen from the vehicle."""
+    plain, hidden = (
+        fuse(world.frame([[6.0, 0], [9.0, y]], boxes_for=[0]), NOBODY, PARAMS).pedestrian_probability
+        for y in (3.0, 0.35)
+    )
+    assert hidden[1] > plain[1] + 0.1
+
+
+def test_a_small_person_without_a_box_is_ruled_out_less_than_a_tall_one(world):
+    """The same bearing, 15 and 55 m away: 140 and 38 pixels tall."""
+    near, far = (
+        fuse(world.frame([[x, 0.0]], boxes_for=[]), NOBODY, PARAMS).pedestrian_probability[0] for x in (15.0, 55.0)
+    )
+    assert far > near + 0.05
+
+
+def test_a_kerb_hides_nobody_from_a_camera(world):
+    """What is low in front of somebody without a box hides no box."""
+    frame = world.frame([[5.0, 0], [11.0, 0]], boxes_for=[])
+    low, tall = (
+        fuse(
+            replace(frame, clusters=replace(frame.clusters, sizes_m=np.array([[0.4, 0.5, height], [0.35, 0.45, 1.6]]))),
+            NOBODY,
+            PARAMS,
+        ).pedestrian_probability
+        for height in (0.15, 1.6)
+    )
+    assert low[1] < 0.45
+    assert tall[1] > 0.55
+
+
+def test_settings_that_would_turn_the_evidence_round_are_refused():
+    with pytest.raises(ValueError, match="full_height_px 25 must be over min_height_px 45"):
+        FusionParams(min_height_px=45.0, full_height_px=25.0)
+
+
+def test_ground_is_where_the_vehicle_stands_at_any_altitude(world):
+    """The same scene on a slope of 5 degrees, at sea level and 300 m above it."""
+    pitch = np.radians(5) / 2
+    found = []
+    for altitude in (0.0, 300.0):
+        pose = transform_matrix([0, 0, altitude], [0, np.sin(pitch), 0, np.cos(pitch)])
+        frame = world.frame([[9.0, 1.0], [7.0, -3.0]])
+        moved = replace(
+            frame,
+            map_from_vehicle=pose,
+            map_from_lidar=pose @ frame.map_from_lidar,
+            cameras=tuple(replace(c, camera_from_map=c.camera_from_map @ inverse(pose)) for c in frame.cameras),
+        )
+        found.append(fuse(moved, NOBODY, PARAMS))
+    assert all(found[0].evidence)
+    assert found[0].evidence == found[1].evidence
+    np.testing.assert_allclose(found[0].pedestrian_probability, found[1].pedestrian_probability, atol=1e-9)

@@ -25,6 +25,20 @@ def make_scan(seed=0, M=8):
     )
 
 
+def corrected(mixture, scan, p_detect, *, labels, params=PARAMS, in_view_at=0.0, pedestrian=0.5):
+    """The correction where everybody is as easy to see."""
+    return correct(
+        mixture,
+        scan,
+        in_view=np.full(len(mixture), p_detect),
+        in_view_at=np.full(len(scan), in_view_at),
+        hidden=np.zeros(labels),
+        pedestrian=np.full(labels, pedestrian),
+        clutter_per_m2=params.clutter_per_m2,
+        params=params,
+    )
+
+
 def plain_update(mixture, scan, p_detect, background, gate_limit):
     """Vo & Ma's Table I, one pair at a time."""
     detected = []
@@ -50,7 +64,8 @@ def test_update_agrees_with_a_plain_loop(make_mixture, seed):
     p_detect = np.random.default_rng(seed).uniform(0.5, 1, len(mixture))
     background = np.full(len(scan), 0.01)
     pairs = gate(mixture, scan, PARAMS.gate)
-    weights, leftover = weigh(mixture.weights, pairs, p_detect, np.ones(len(pairs.component)), background)
+    ones = np.ones(len(pairs.component))
+    weights, leftover = weigh(mixture.weights, pairs, p_detect[pairs.component], ones, background)
     missed, detected = update(mixture, pairs, weights, scan.covariances_m2, p_detect)
     expected = plain_update(mixture, scan, p_detect, background, PARAMS.gate)
     assert list(zip(pairs.component.tolist(), pairs.measurement.tolist(), strict=True)) == [e[:2] for e in expected]
@@ -89,29 +104,17 @@ def test_one_component_and_one_detection_is_a_kalman_filter():
 @given(seeds, st.floats(0, 1))
 def test_no_detections_scale_the_mass(make_mixture, seed, p_detect):
     mixture = make_mixture(seed)
-    correction = correct(
-        mixture,
-        empty_measurements(),
-        p_detect=np.full(len(mixture), p_detect),
-        label_probability=np.full(4, 0.5),
-        params=PARAMS,
-    )
+    correction = corrected(mixture, empty_measurements(), p_detect, labels=4)
     np.testing.assert_allclose(correction.mixture.weights.sum(), (1 - p_detect) * mixture.weights.sum())
     assert (correction.explained == 0).all()
 
 
 @given(seeds)
 def test_weights_and_covariances_stay_sound(make_mixture, seed):
-    mixture = make_mixture(seed)
-    predicted = predict(mixture, 0.1, PARAMS, 0.99)
-    np.testing.assert_allclose(predicted.weights, 0.99 * mixture.weights)
-    correction = correct(
-        predicted,
-        make_scan(seed),
-        p_detect=np.full(len(mixture), 0.9),
-        label_probability=np.full(4, 0.5),
-        params=PARAMS,
-    )
+    mixture = reduce(make_mixture(seed, J=24), PARAMS)  # sorted by label, as the tracker's is
+    predicted = predict(mixture, 0.1, PARAMS)
+    np.testing.assert_array_equal(predicted.weights, mixture.weights)
+    correction = corrected(predicted, make_scan(seed), 0.9, labels=4)
     posterior = reduce(correction.mixture, PARAMS)
     assert (correction.mixture.weights >= 0).all()
     assert (posterior.weights > 0).all()
@@ -125,7 +128,7 @@ def test_weights_and_covariances_stay_sound(make_mixture, seed):
 def test_each_label_owns_one_measurement_and_the_best_way(make_mixture, seed):
     mixture, scan = make_mixture(seed, J=5, L=3), make_scan(seed, 4)
     pairs = gate(mixture, scan, PARAMS.gate)
-    weights, _ = weigh(mixture.weights, pairs, np.full(5, 0.9), np.ones(len(pairs.component)), np.full(len(scan), 0.01))
+    weights, _ = weigh(mixture.weights, pairs, *np.full((2, len(pairs.component)), 0.9), np.full(len(scan), 0.01))
     owned = own(mixture.labels, pairs, weights)
     chosen = {(int(mixture.labels[j]), int(m)) for j, m in zip(pairs.component[owned], pairs.measurement[owned])}  # noqa: B905
     assert len({label for label, _ in chosen}) == len({m for _, m in chosen}) == len(chosen)
@@ -139,15 +142,59 @@ def test_a_measurement_a_track_accounts_for_gives_next_to_no_birth():
     cov = np.diag([0.02, 0.02, 0.5, 0.5])
     mixture = GaussianMixture(np.ones(1), np.zeros((1, 4)), cov[None], np.zeros(1, np.int64))
     scan = make_measurements(np.array([[0.0, 0.0], [10.0, 0.0]]), np.eye(2) * 0.02)
-    births = correct(mixture, scan, p_detect=np.array([0.9]), label_probability=np.array([0.5]), params=PARAMS).births
+    births = corrected(mixture, scan, 0.9, labels=1).births
     assert births[0] < births[1] / 100
 
 
 def test_the_cameras_word_moves_births(make_mixture):
     scan = make_measurements(np.array([[0.0, 0.0], [10.0, 0.0]]), np.eye(2) * 0.02, np.array([0.05, 0.95]))
     empty = make_mixture(J=0)
-    births = correct(empty, scan, p_detect=np.zeros(0), label_probability=np.zeros(0), params=PARAMS).births
+    births = corrected(empty, scan, 0.9, labels=0).births
     assert births[1] > 10 * births[0]
+
+
+def standing(*places, sigma_m=0.1):
+    """One sure person per place, not moving."""
+    means = np.zeros((len(places), 4))
+    means[:, :2] = places
+    cov = np.diag([sigma_m**2, sigma_m**2, 0.1, 0.1])
+    return GaussianMixture(np.full(len(places), 0.9), means, np.tile(cov, (len(places), 1, 1)), np.arange(len(places)))
+
+
+def test_a_miss_beside_a_measured_neighbour_may_be_a_merged_cluster():
+    """Three people, one measurement: the one next to it may be in it, the one far away may not."""
+    scan = make_measurements(np.array([[0.0, 0.0]]), np.eye(2) * 0.01)
+    mixture = standing([0, 0], [0.3, 0], [5, 0])
+    correction = corrected(mixture, scan, 0.9, labels=3)
+    assert correction.measurement.tolist() == [0, -1, -1]
+    owner, near, far = correction.unresolved
+    assert owner == 0 == pytest.approx(far, abs=1e-9)
+    assert 0.3 < near < 0.8
+    assert correction.missed_mass[1] > 2 * correction.missed_mass[2]
+    apart = corrected(mixture, scan, 0.9, labels=3, params=FilterParams(resolution_m=0.0))
+    assert apart.unresolved.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_half_of_the_people_at_the_resolution_are_not_seen_apart():
+    scan = make_measurements(np.array([[0.0, 0.0]]), np.eye(2) * 0.0025)
+    exact = standing([0, 0], [PARAMS.resolution_m, 0], sigma_m=1e-3)
+    assert corrected(exact, scan, 0.9, labels=2).unresolved[1] == pytest.approx(0.5, abs=0.02)
+
+
+def test_what_is_surely_nobody_keeps_no_pedestrian_alive():
+    """A car's cluster next to where somebody is hidden."""
+    scan = make_measurements(np.array([[0.3, 0.0]]), np.eye(2) * 0.01, np.array([0.01]))
+    assert corrected(standing([0, 0]), scan, 0.9, labels=1, pedestrian=0.95).measurement.tolist() == [-1]
+    assert corrected(standing([0, 0]), scan, 0.9, labels=1, pedestrian=0.05).measurement.tolist() == [0]
+
+
+def test_what_was_measured_was_in_view():
+    """The prediction lies just outside the view, the measurement inside: it is still the label's."""
+    scan = make_measurements(np.array([[0.1, 0.0]]), np.eye(2) * 0.01)
+    assert corrected(standing([0, 0]), scan, 0.0, labels=1).measurement.tolist() == [-1]
+    seen = corrected(standing([0, 0]), scan, 0.0, labels=1, in_view_at=0.9)
+    assert seen.measurement.tolist() == [0]
+    assert seen.explained[0] > 0.9
 
 
 def test_gate_of_nothing(make_mixture):

@@ -59,3 +59,16 @@ def test_wrong_shapes_are_refused():
         make_measurements(np.zeros((3, 3)), np.eye(2))
     with pytest.raises(ValueError, match="2 positions, 3 covariances"):
         make_measurements(np.zeros((2, 2)), np.ones((3, 2, 2)))
+
+
+def test_the_last_tie_does_not_fall_to_the_order_of_input():
+    """Two measurements that differ in the covariance's last entry only."""
+    covs = np.array([np.diag([0.04, 0.05]), np.diag([0.04, 0.09])])
+    a, b = (make_measurements(np.zeros((2, 2)), covs[order], np.full(2, 0.5)) for order in ([0, 1], [1, 0]))
+    assert np.array_equal(a.covariances_m2, b.covariances_m2)
+
+
+def test_a_refused_measurement_without_a_cluster_names_none():
+    scan = make_measurements(np.array([[np.nan, 0.0], [1e9, 0.0]]), np.eye(2), cluster_index=np.array([-1, 3]))
+    assert scan.refused == 2
+    assert scan.refused_cluster_index.tolist() == [3]

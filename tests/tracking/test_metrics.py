@@ -7,6 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.optimize import linear_sum_assignment
 
 from tracking.metrics import (
     ScoredFrame,
@@ -16,6 +17,7 @@ from tracking.metrics import (
     hota,
     idf1,
     ospa,
+    ospa2,
     score,
     similarity,
 )
@@ -87,6 +89,108 @@ def test_ospa_agrees_with_stone_soup(a, b):
     a_states, b_states = ([states.State(row[:, None], timestamp=now) for row in rows] for rows in (a, b))
     expected = metrics.OSPAMetric(c=2.0, p=1.0).compute_OSPA_distance(a_states, b_states).value
     assert ospa(a, b) == pytest.approx(float(expected), abs=1e-9)
+
+
+def test_gospa_agrees_with_stone_soup():
+    """Over a sequence, part by part: theirs are sums of distances to the power of p, which is 1."""
+    metrics = pytest.importorskip("stonesoup.metricgenerator.ospametric")
+    states = pytest.importorskip("stonesoup.types.state")
+    now = datetime.datetime(2020, 1, 1)
+    theirs = metrics.GOSPAMetric(c=2.0, p=1.0)
+    for each in random_drive(3):
+        people, tracks = (
+            [states.State(row[:, None], timestamp=now) for row in rows] for rows in (each.truth_m, each.tracks_m)
+        )
+        expected = theirs.compute_gospa_metric(tracks, people)[0].value
+        parts = gospa(each.truth_m, each.tracks_m)
+        wanted = [float(expected[name]) for name in ("distance", "localisation", "missed", "false")]
+        assert (parts.total, parts.localisation, parts.missed, parts.false) == pytest.approx(wanted, abs=1e-9)
+
+
+# --- OSPA(2) ----------------------------------------------------------------------------------------------------------
+
+
+def plain_ospa2(frames, cutoff_m, order, window_scans):
+    """By the definition, pair by pair and scan by scan."""
+    values = []
+    for end in range(1, len(frames) + 1):
+        window = [
+            (
+                dict(zip(f.truth_ids.tolist(), f.truth_m, strict=True)),
+                dict(zip(f.track_ids.tolist(), f.tracks_m, strict=True)),
+            )
+            for f in frames[max(0, end - window_scans) : end]
+        ]
+        people = sorted({i for truth, _ in window for i in truth})
+        tracks = sorted({i for _, found in window for i in found})
+        base = np.full((len(people), len(tracks)), cutoff_m)
+        for a, person in enumerate(people):
+            for b, track in enumerate(tracks):
+                apart = [
+                    ospa(
+                        np.array([t[person]] if person in t else NONE),
+                        np.array([f[track]] if track in f else NONE),
+                        cutoff_m,
+                    )
+                    for t, f in window
+                    if person in t or track in f
+                ]
+                base[a, b] = np.mean(apart)
+        n = max(base.shape)
+        cost = base[linear_sum_assignment(base**order)] ** order
+        values.append(((cost.sum() + (n - len(cost)) * cutoff_m**order) / n) ** (1 / order) if n else 0.0)
+    return np.mean(values)
+
+
+def test_ospa2_by_hand():
+    """One path 0.5 m off for two scans of four, not there for one, 9 m off for one: (0.5 + 0.5 + 2 + 2) / 4."""
+    tracks = [{7: (0, 0.5)}, {7: (1, -0.5)}, {}, {7: (3, 9)}]
+    frames = [frame({1: (k, 0)}, found) for k, found in enumerate(tracks)]
+    assert ospa2(frames, window_scans=4) == pytest.approx((0.5 + 0.5 + 3 / 3 + 5 / 4) / 4)
+    assert ospa2(frames, window_scans=1) == pytest.approx(np.mean([0.5, 0.5, 2, 2]))
+
+
+def test_ospa2_of_two_paths_and_one_too_many():
+    """Person 2 is never found and track 8 is on nobody: (0 + 2 + 2) / 3 with a second false track that comes later."""
+    frames = [
+        frame({1: (0, 0), 2: (9, 0)}, {7: (0, 0), 8: (-9, 0)}),
+        frame({1: (1, 0), 2: (9, 0)}, {7: (1, 0), 8: (-9, 0), 9: (0, 20)}),
+    ]
+    assert ospa2(frames) == pytest.approx(((0 + 2) / 2 + (0 + 2 + 2) / 3) / 2)
+
+
+def test_ospa2_charges_for_a_change_of_identity_which_ospa_does_not_see():
+    kept = [frame({1: (k, 0)}, {7: (k, 0)}) for k in range(10)]
+    changed = [frame({1: (k, 0)}, {7 + (k >= 5): (k, 0)}) for k in range(10)]
+    assert score(kept).ospa_m == score(changed).ospa_m == 0
+    assert ospa2(kept) == 0
+    # From scan 5 on track 7 explains five scans of k + 1, and track 8 is one too many.
+    assert ospa2(changed) == pytest.approx(sum((2 * (k - 4) / (k + 1) + 2) / 2 for k in range(5, 10)) / 10)
+
+
+@pytest.mark.parametrize("order", [1.0, 2.0])
+@pytest.mark.parametrize("window_scans", [1, 4, 50])
+def test_ospa2_agrees_with_a_plain_loop(window_scans, order):
+    for seed in range(3):
+        frames = random_drive(seed, 15)
+        expected = plain_ospa2(frames, 2.0, order, window_scans)
+        assert ospa2(frames, 2.0, order, window_scans) == pytest.approx(expected, abs=1e-9)
+
+
+def test_ospa2_of_one_scan_is_ospa():
+    frames = random_drive(1)
+    assert ospa2(frames, window_scans=1) == pytest.approx(score(frames).ospa_m)
+
+
+def test_ospa2_of_nothing_and_of_what_is_ignored():
+    assert ospa2([]) == 0
+    assert ospa2([frame({}, {}), frame({}, {})]) == 0
+    assert ospa2([frame({1: (0, 0)}, {}), frame({1: (0, 0)}, {})]) == 2
+    alone = [frame({1: (k, 0)}, {7: (k, 0.1)}) for k in range(5)]
+    beside = [frame({1: (k, 0), 2: (k, 5)}, {7: (k, 0.1), 8: (k, 5.5)}, [2]) for k in range(5)]
+    assert ospa2(beside) == pytest.approx(ospa2(alone))
+    with pytest.raises(ValueError, match="window_scans must be at least 1, got 0"):
+        ospa2(alone, window_scans=0)
 
 
 def trackeval_scores(frames):

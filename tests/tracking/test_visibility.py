@@ -38,7 +38,7 @@ def test_low_things_hide_little(world):
     frame = world.frame([[5, 0]])
     low = replace(frame, clusters=replace(frame.clusters, sizes_m=np.array([[0.4, 0.5, 0.2]])))
     behind = np.array([[10.0, 0]])
-    assert detection_probability(low, PARAMS)(behind) > 5 * detection_probability(frame, PARAMS)(behind)
+    assert detection_probability(low, PARAMS)(behind) > 2 * detection_probability(frame, PARAMS)(behind)
 
 
 def test_half_covered():
@@ -57,3 +57,14 @@ def test_nobody_and_nothing(world):
     assert detection_probability(frame, PARAMS)(np.zeros((0, 2))).shape == (0,)
     bad = replace(frame, clusters=LidarClusters(1, "lidar", np.full((1, 3), np.nan), np.ones((1, 3)), np.array([4])))
     assert detection_probability(bad, PARAMS)(np.array([[3.0, 0]])) == pytest.approx(PARAMS.p_detect)
+
+
+def test_a_cluster_of_an_impossible_size_hides_nobody(world):
+    frame = world.frame([[5, 0]])
+    huge = replace(frame, clusters=replace(frame.clusters, sizes_m=np.array([[2e4, 2e4, 2.0]])))
+    assert detection_probability(huge, PARAMS)(np.array([[10.0, 0]])) == pytest.approx(PARAMS.p_detect)
+
+
+def test_ranges_the_wrong_way_round_are_refused():
+    with pytest.raises(ValueError, match="max_range_m 55 must be over full_range_m 60"):
+        VisibilityParams(full_range_m=60.0)
