@@ -15,10 +15,13 @@ from replay.cli_common import (
     DRIVES,
     EXIT_ERROR,
     EXIT_REFUSED,
+    Duration,
     Log,
     Remaps,
     Salvage,
     SettingsFile,
+    Start,
+    Strict,
     TimeOffsets,
     console,
     errors,
@@ -80,10 +83,8 @@ def replay(
     summary: Annotated[
         Path | None, typer.Option("--json", metavar="SUMMARY.json", help="Write the summary as JSON.")
     ] = None,
-    start: Annotated[float, typer.Option(min=0, metavar="S", help="Begin this many seconds into the log.")] = 0,
-    duration: Annotated[
-        float | None, typer.Option(min=0.001, metavar="S", help="Stop after this many seconds. [default: all]")
-    ] = None,
+    start: Start = 0,
+    duration: Duration = None,
     predictor: Annotated[
         PredictorMode, typer.Option(help="A process of its own, one already running, or this process.")
     ] = PredictorMode.spawned,
@@ -102,9 +103,7 @@ def replay(
     rate: Annotated[
         float | None, typer.Option(min=0.01, metavar="R", help="Times real time. [default: as fast as possible]")
     ] = None,
-    strict: Annotated[
-        bool, typer.Option("--strict", metavar="", help="Stop at the first message that is refused.")
-    ] = False,
+    strict: Strict = False,
     salvage: Salvage = False,
     topic: Remaps = None,
     time_offset: TimeOffsets = None,

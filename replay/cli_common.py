@@ -27,6 +27,11 @@ Remaps = Annotated[
     list[str] | None,
     typer.Option("--topic", metavar="NAME:=NAME", help="Read a topic under another name, e.g. /vn100/odometry:=/odom."),
 ]
+Start = Annotated[float, typer.Option(min=0, metavar="S", help="Begin this many seconds into the log.")]
+Duration = Annotated[
+    float | None, typer.Option(min=0.001, metavar="S", help="Stop after this many seconds. [default: all]")
+]
+Strict = Annotated[bool, typer.Option("--strict", metavar="", help="Stop at the first message that is refused.")]
 Salvage = Annotated[bool, typer.Option("--salvage", metavar="", help="Read every intact chunk of a damaged file.")]
 TimeOffsets = Annotated[
     list[str] | None,

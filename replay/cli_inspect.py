@@ -10,10 +10,12 @@ from rich.progress import Progress
 
 from replay.cli_common import (
     DRIVES,
+    Duration,
     Log,
     Remaps,
     Salvage,
     SettingsFile,
+    Start,
     TimeOffsets,
     closing_lines,
     console,
@@ -45,10 +47,8 @@ def inspect(
         float | None, typer.Option(min=0, metavar="S", help="Take the frame nearest this time apart.")
     ] = None,
     frames: Annotated[bool, typer.Option("--frames", metavar="", help="Take every frame apart.")] = False,
-    start: Annotated[float, typer.Option(min=0, metavar="S", help="Begin this many seconds into the log.")] = 0,
-    duration: Annotated[
-        float | None, typer.Option(min=0.001, metavar="S", help="Stop after this many seconds. [default: all]")
-    ] = None,
+    start: Start = 0,
+    duration: Duration = None,
     as_json: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write all of it as JSON, every frame included.")
     ] = None,

@@ -10,10 +10,13 @@ from rich.table import Table
 
 from replay.cli_common import (
     DRIVES,
+    Duration,
     Log,
     Remaps,
     Salvage,
     SettingsFile,
+    Start,
+    Strict,
     TimeOffsets,
     closing_lines,
     console,
@@ -45,18 +48,14 @@ def label(
     summary: Annotated[
         Path | None, typer.Option("--json", metavar="SUMMARY.json", help="Write the summary as JSON.")
     ] = None,
-    start: Annotated[float, typer.Option(min=0, metavar="S", help="Begin this many seconds into the log.")] = 0,
-    duration: Annotated[
-        float | None, typer.Option(min=0.001, metavar="S", help="Stop after this many seconds. [default: all]")
-    ] = None,
+    start: Start = 0,
+    duration: Duration = None,
     min_duration: Annotated[float, typer.Option(min=0, metavar="S", help="Leave shorter trajectories out.")] = 1.0,
     min_hits: Annotated[int, typer.Option(min=1, metavar="N", help="Leave out those of fewer measurements.")] = 5,
     max_gap: Annotated[
         float, typer.Option(min=0.001, metavar="S", help="Cut trajectories where nothing is measured for longer.")
     ] = 0.5,
-    strict: Annotated[
-        bool, typer.Option("--strict", metavar="", help="Stop at the first message that is refused.")
-    ] = False,
+    strict: Strict = False,
     salvage: Salvage = False,
     topic: Remaps = None,
     time_offset: TimeOffsets = None,

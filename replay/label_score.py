@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from pcgan.trajectory_file import TrajectoryRows
-from replay.score import MATCH_M, MIN_LIDAR_POINTS
+from replay.score import nearest_pairs, scored_frame
 from schemas.messages import FloatArray, GroundTruthFrame, IntArray
 from tracking.label_report import LabelReport, Verdict
 from tracking.metrics import ScoredFrame, drop_ignored, score
@@ -79,18 +78,13 @@ class LabelScore:
 
 def _scored(states: _States, truth: GroundTruthFrame) -> ScoredFrame:
     """Returns positions and truth without the people whom the LiDAR hardly saw."""
-    ignored = truth.lidar_points < MIN_LIDAR_POINTS
-    return drop_ignored(
-        ScoredFrame(truth.ids.astype(np.int64), truth.positions_m, states.ids, states.states[:, :2], ignored)
-    )
+    return drop_ignored(scored_frame(states.ids, states.states[:, :2], truth))
 
 
 def _matched(frame: ScoredFrame) -> set[tuple[int, int]]:
-    """Returns which person (first) each id (second) stands for: one to one, least total distance, within 1 m."""
-    distances = frame.distances()
-    rows, columns = linear_sum_assignment(np.minimum(distances, MATCH_M))
-    near = distances[rows, columns] < MATCH_M
-    return set(zip(frame.truth_ids[rows[near]].tolist(), frame.track_ids[columns[near]].tolist(), strict=True))
+    """Returns which person (first) each id (second) stands for."""
+    rows, columns = nearest_pairs(frame.distances())
+    return set(zip(frame.truth_ids[rows].tolist(), frame.track_ids[columns].tolist(), strict=True))
 
 
 def _errors(states: _States, truth: GroundTruthFrame, pairs: list[tuple[int, int]]) -> FloatArray:

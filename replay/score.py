@@ -103,7 +103,9 @@ class ReplayScore:
         if truth is not None:
             self._true.append(true_positions(truth))
             person_of = match(tracks, truth)
-            self._frames.append(drop_ignored(_scored_frame(tracks, truth)))
+            ids = np.array([track.id for track in tracks], np.int64)
+            places = np.array([track.state[:2] for track in tracks]).reshape(-1, 2)
+            self._frames.append(drop_ignored(_small(scored_frame(ids, places, truth))))
             self._scans_on.update(truth.ids[truth.lidar_points >= MIN_LIDAR_POINTS].tolist())
             self._found.update(person_of.tolist())
             usual = [not prediction.fallback for prediction in result.predictions.predictions]
@@ -281,20 +283,32 @@ def match(tracks: Sequence[Track], truth: GroundTruthFrame) -> IntArray:
     person_of = np.full(len(tracks), -1, np.int64)
     if len(tracks) and len(truth.ids):
         positions = np.array([track.state[:2] for track in tracks])
-        distances = np.linalg.norm(positions[:, None] - truth.positions_m, axis=-1)
-        rows, columns = linear_sum_assignment(np.minimum(distances, MATCH_M))
-        near = distances[rows, columns] < MATCH_M
-        person_of[rows[near]] = truth.ids[columns[near]]
+        rows, columns = nearest_pairs(np.linalg.norm(positions[:, None] - truth.positions_m, axis=-1))
+        person_of[rows] = truth.ids[columns]
     return person_of
 
 
-def _scored_frame(tracks: Sequence[Track], truth: GroundTruthFrame) -> ScoredFrame:
+def nearest_pairs(distances_m: FloatArray) -> tuple[IntArray, IntArray]:
+    """Returns rows (n,) and columns (n,) of distances (A, B) that go together: one to one, least total, within 1 m."""
+    rows, columns = linear_sum_assignment(np.minimum(distances_m, MATCH_M))
+    near = distances_m[rows, columns] < MATCH_M
+    return rows[near], columns[near]
+
+
+def scored_frame(ids: IntArray, positions_m: FloatArray, truth: GroundTruthFrame) -> ScoredFrame:
+    """Returns tracks (B,) at positions (B, 2) beside the truth; whom the LiDAR hardly saw is ignored."""
+    ignored = truth.lidar_points < MIN_LIDAR_POINTS
+    return ScoredFrame(truth.ids.astype(np.int64), truth.positions_m, ids, positions_m, ignored)
+
+
+def _small(frame: ScoredFrame) -> ScoredFrame:
+    """Returns the frame in half of the memory: a whole drive of them is kept."""
     return ScoredFrame(
-        truth.ids.astype(np.int32),
-        truth.positions_m.astype(np.float32),
-        np.array([track.id for track in tracks], np.int32),
-        np.array([track.state[:2] for track in tracks], np.float32).reshape(-1, 2),
-        truth.lidar_points < MIN_LIDAR_POINTS,
+        frame.truth_ids.astype(np.int32),
+        frame.truth_m.astype(np.float32),
+        frame.track_ids.astype(np.int32),
+        frame.tracks_m.astype(np.float32),
+        frame.ignored,
     )
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from schemas.messages import FloatArray, IntArray
-from tracking.box_matching import CameraView, look, pedestrian_boxes
+from tracking.box_matching import Boxes, CameraView, look, pedestrian_boxes
 from tracking.camera_only import GroundPoints, ground_points, lonely_boxes
 from tracking.cluster_splitting import split_clusters
 from tracking.clusters import Clusters, place, positions, size_log_odds, sound_clusters
@@ -99,14 +99,16 @@ class _Scene:
 def _scene(frame: SensorFrame, clusters: Clusters, predicted: PredictedTracks, params: FusionParams) -> _Scene:
     """Looks at the clusters through the cameras, and once more where that showed some of them to be several people."""
     cameras = tuple(sorted(frame.cameras, key=lambda camera: camera.name))
-    scene = _look(frame, cameras, clusters, predicted, params)
+    boxes = pedestrian_boxes(cameras, params.pedestrian_labels)
+    scene = _look(frame, cameras, boxes, clusters, predicted, params)
     split = split_clusters(clusters, cameras, scene.moved_m, scene.view, params)
-    return scene if split is None else _look(frame, cameras, split, predicted, params)
+    return scene if split is None else _look(frame, cameras, boxes, split, predicted, params)
 
 
 def _look(
     frame: SensorFrame,
     cameras: tuple[CameraFrame, ...],
+    boxes: Boxes,
     clusters: Clusters,
     predicted: PredictedTracks,
     params: FusionParams,
@@ -123,7 +125,6 @@ def _look(
     rank = (0.2 + 0.8 * visible) / (1 + np.exp(-person_like - 1))
     delays_s = np.array([camera.detections.stamp_ns - frame.stamp_ns for camera in cameras]) * 1e-9
     moved = where + _velocities(where, predicted, params) * delays_s[:, None, None]  # (C, M, 2)
-    boxes = pedestrian_boxes(cameras, params.pedestrian_labels)
     view = look(cameras, boxes, moved, _ground(frame, clusters, params), rank, params)
     return _Scene(cameras, clusters, where, covs, person_like, visible, moved, view)
 

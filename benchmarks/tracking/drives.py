@@ -40,12 +40,11 @@ from benchmarks.tracking.variants import (
 )
 from pcgan.evaluation import append_lines, commit
 from replay.inspection import inspect_frames
-from replay.score import MIN_LIDAR_POINTS
+from replay.score import MIN_LIDAR_POINTS, scored_frame
 from replay.session import Replay
 from replay.simulator import simulate
 from replay.time_sync import SyncedFrame
 from replay.training_windows import HELD_OUT_DRIVES
-from schemas.messages import FloatArray, GroundTruthFrame, IntArray
 from tracking.metrics import ScoredFrame, TrackingScore, drop_ignored, ospa2, score
 
 RESULTS = Path(__file__).with_name("drives.json")
@@ -120,7 +119,7 @@ def remaining_errors(replay: Replay) -> Counter[str]:
             if person.miss is not None:
                 causes["missed: " + ("seen for less than 0.3 s" if since_s < NEW_S else person.miss)] += 1
         tracks = inspected.tracks.tracks
-        scored = drop_ignored(_scored(*arrays(tracks), truth))
+        scored = drop_ignored(scored_frame(*arrays(tracks), truth))
         paired = scored.distances() < MATCH_M
         rows, columns = linear_sum_assignment(paired, maximize=True)
         nobodys = np.setdiff1d(np.arange(len(scored.track_ids)), columns[paired[rows, columns]])
@@ -134,11 +133,6 @@ def remaining_errors(replay: Replay) -> Counter[str]:
     return causes
 
 
-def _scored(ids: IntArray, positions_m: FloatArray, truth: GroundTruthFrame) -> ScoredFrame:
-    ignored = truth.lidar_points < MIN_LIDAR_POINTS
-    return ScoredFrame(truth.ids.astype(np.int64), truth.positions_m, ids, positions_m, ignored)
-
-
 def run(frames: Sequence[SyncedFrame], drive: str, variant: Variant | PeerVariant) -> Result:
     """Tracks a drive and scores the tracks."""
     steps = list(variant.track(frames))
@@ -148,7 +142,7 @@ def run(frames: Sequence[SyncedFrame], drive: str, variant: Variant | PeerVarian
         truth = step.frame.ground_truth
         if truth is None:
             continue
-        scored.append(_scored(step.ids, step.positions_m, truth))
+        scored.append(scored_frame(step.ids, step.positions_m, truth))
         near = np.hypot(*(truth.positions_m - step.frame.sensors.map_from_lidar[:2, 3]).T) < NEAR_M
         unseen = scored[-1].ignored & near
         hidden += int(unseen.sum())
