@@ -1,8 +1,10 @@
 """How fast a replay is, and whether its memory grows with the log.
 
-python -m benchmarks.realtime [--pedestrians 30] [--minutes 1 10] [--repeats 3] [--without-truth] [--json F]
+python -m benchmarks.realtime [--pedestrians 30] [--minutes 1 10] [--repeats 3] [--formats pcgan ros2 foxglove json]
+                              [--without-truth] [--json F]
 
-Each replay is the command itself, in a process of its own with its predictor, on a simulated drive without --rrd.
+Each replay is the command itself, in a process of its own with its predictor, on a simulated drive without --rrd. With
+several formats the same drive is written as other stacks write it, and the replays take turns.
 """
 
 import argparse
@@ -11,6 +13,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from replay.simulator import simulate
+from tests.replay import foreign_foxglove, foreign_ros
 
 _MEASURED = """
 import resource, sys
@@ -43,6 +47,7 @@ def main() -> None:
     parser.add_argument(
         "--without-truth", action="store_true", help="as a real drive: no ground truth, so no scores of the whole drive"
     )
+    parser.add_argument("--formats", nargs="+", choices=sorted(FORMATS), default=["pcgan"])
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     rows = []
@@ -53,10 +58,20 @@ def main() -> None:
             simulate(log, clip=None, vehicle=None, pedestrians=arguments.pedestrians, duration_s=60 * minutes, seed=1)
             if arguments.without_truth:
                 log = drop_truth(log, folder / "recorded.mcap")
-            rows += [{"minutes": minutes, **measure(log, folder)} for _ in range(arguments.repeats)]
+            logs = {name: FORMATS[name](log, folder / f"{name}.mcap") for name in arguments.formats}
+            for _ in range(arguments.repeats):
+                rows += [{"minutes": minutes, "format": name, **measure(each, folder)} for name, each in logs.items()]
     show(rows)
     if arguments.json:
         arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+FORMATS: dict[str, Callable[[Path, Path], Path]] = {
+    "pcgan": lambda log, _: log,
+    "ros2": foreign_ros.as_ros2,
+    "foxglove": foreign_foxglove.as_foxglove,
+    "json": foreign_foxglove.as_foxglove_json,
+}  # as the tests' writers make them; that of ROS 2 has no ground truth
 
 
 def drop_truth(log: Path, output: Path) -> Path:
@@ -101,10 +116,13 @@ def measure(log: Path, folder: Path) -> dict[str, Any]:
 
 def show(rows: list[dict[str, Any]]) -> None:
     """Prints the rows as a table."""
-    table = Table("minutes", "tracks a frame", "times real time", "replay CPU ms", "predictor CPU ms", "replay MiB")
+    table = Table(
+        "minutes", "format", "tracks a frame", "times real time", "replay CPU ms", "predictor CPU ms", "replay MiB"
+    )
     for row in rows:
         table.add_row(
             f"{row['minutes']:g}",
+            row["format"],
             f"{row['tracks_per_frame']:.1f}",
             f"{row['realtime_factor']:.1f}",
             f"{row['replay_cpu_ms_per_frame']:.2f}",

@@ -92,7 +92,7 @@ def data_folders() -> tuple[Path, ...]:
         return found
     looked = ", ".join(map(str, candidates))
     raise DataNotFound(
-        f"no data sets in {looked}; download them (`pcgan data get dut`), or set PCGAN_DATA to the folder that holds"
+        f"no data sets in {looked}; download them (`pcgan data get NAME`), or set PCGAN_DATA to the folder that holds"
         " dut/, citr/ and eth_ucy/"
     )
 

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from pcgan import checkpoint, inference
+from pcgan.corridor import Corridor, Futures, corridor_of, entries
 from pcgan.extrapolation import extrapolate
 from pcgan.history import observations, vehicle_states
 from pcgan.inference import NumpyGenerator
 from pcgan.model import Generator
+from pcgan.vehicle_path import drive_on, motion_at
 from schemas.messages import (
     BoolArray,
     FloatArray,
@@ -20,6 +22,7 @@ from schemas.messages import (
     PredictionFrame,
     Track,
     TrackFrame,
+    VehiclePath,
 )
 
 # How well a tracker usually knows where somebody is, standard deviation per axis: networks have learnt from such
@@ -33,10 +36,10 @@ class _Arrays:
 
     probabilities: FloatArray  # (A, L) 0 where there is no path
     paths_m: FloatArray  # (A, L, P, 2) float64
-    weights: FloatArray  # (A, P, K) float32, as the rest
-    means_m: FloatArray  # (A, P, K, 2)
-    sigmas_m: FloatArray  # (A, P, K, 2)
-    rhos: FloatArray  # (A, P, K)
+    weights: FloatArray  # (A, P, K) float32
+    means_m: FloatArray  # (A, P, K, 2) float64: metres in the frame of the tracks may be millions
+    sigmas_m: FloatArray  # (A, P, K, 2) float32
+    rhos: FloatArray  # (A, P, K) float32
 
 
 class Predictor:
@@ -53,6 +56,7 @@ class Predictor:
         self.dt_s = generator.config.dt_s
         self._generator = NumpyGenerator(generator)
         ages = np.arange(self.config.observed_steps - 1, -1, -1)
+        self._ahead_s = self.dt_s * np.arange(self.config.predicted_steps + 1)  # (P + 1,) from now to the horizon
         self._ages_ns = np.round(ages * self.dt_s * 1e9).astype(np.int64)  # (T,) oldest first
 
     @staticmethod
@@ -69,7 +73,12 @@ class Predictor:
         are not coasting. The others are extrapolated from the tracker's state and covariance, marked `fallback`.
         Positions are absolute, in the frame's own coordinates.
 
-        Raises ValueError, naming the tracks, if what is needed of one is not finite; decoded frames always are.
+        The network sees how the vehicle came here, not where it is going: the frame's `vehicle_path` changes the
+        figures of the corridor (`corridor.py`) and nothing else. Without one the vehicle's present motion is carried
+        on; without a vehicle nobody enters its corridor.
+
+        Raises ValueError, naming the tracks, if what is needed of one is not finite, and if the vehicle's path is not;
+        decoded frames always are.
         """
         times_ns = frame.stamp_ns - self._ages_ns
         with np.errstate(invalid="ignore"):  # what is not finite is refused below
@@ -77,19 +86,34 @@ class Predictor:
         states = np.array([track.state for track in frame.tracks], float).reshape(-1, 4)
         covariances = np.array([track.covariance for track in frame.tracks], float).reshape(-1, 4, 4)
         _require_finite(frame.tracks, positions, states, covariances)
+        path = frame.vehicle_path
+        if path is None:
+            path = self._driven_on(frame)
+        elif len(path.times_s) == 0 or not all(np.isfinite(values).all() for values in vars(path).values()):
+            raise ValueError("the vehicle's path has no poses, or holds NaN or infinity")
+        corridor = corridor_of(path, self.dt_s, self.config.predicted_steps) if path and frame.tracks else None
         predictions: list[Prediction | None] = [None] * len(frame.tracks)
         if usable.any():
             vehicle = vehicle_states(frame.vehicle_history, times_ns) if self.config.uses_vehicle else None
             rows = np.flatnonzero(usable).tolist()
             of_position = covariances[usable][:, :2, :2]
             predicted = self._forward(positions[usable], seen[usable], states[usable], of_position, vehicle)
-            self._fill(predictions, frame.tracks, rows, predicted, False)
+            risks = _risks(corridor, states[usable], covariances[usable], predicted)
+            self._fill(predictions, frame.tracks, rows, predicted, risks, False)
         if not usable.all():
             rows = np.flatnonzero(~usable).tolist()
             extrapolated = _fallback(states[~usable], covariances[~usable], self.dt_s, self.config.predicted_steps)
-            self._fill(predictions, frame.tracks, rows, extrapolated, True)
+            risks = _risks(corridor, states[~usable], covariances[~usable], extrapolated)
+            self._fill(predictions, frame.tracks, rows, extrapolated, risks, True)
         answered = tuple(prediction for prediction in predictions if prediction is not None)
-        return PredictionFrame(frame.sequence, frame.stamp_ns, frame.frame_id, self.model_name, self.dt_s, answered)
+        return PredictionFrame(
+            frame.sequence, frame.stamp_ns, frame.frame_id, self.model_name, self.dt_s, answered, path
+        )
+
+    def _driven_on(self, frame: TrackFrame) -> VehiclePath | None:
+        """Returns the vehicle's path if it goes on moving as it does, or None if it has not been seen lately."""
+        motion = motion_at(frame.vehicle_history, frame.stamp_ns)
+        return None if motion is None else drive_on(motion, self._ahead_s)
 
     def _forward(
         self,
@@ -116,22 +140,28 @@ class Predictor:
             probabilities=probabilities.T,
             paths_m=np.ascontiguousarray((inference.points_to_scene(points, heading) + where).T),
             weights=np.ascontiguousarray(scene.weights.T),
-            means_m=np.ascontiguousarray((scene.means_m + where).T, np.float32),
+            means_m=np.ascontiguousarray((scene.means_m + where).T),
             sigmas_m=np.ascontiguousarray(scene.sigmas_m.T),
             rhos=np.ascontiguousarray(scene.rhos.T),
         )
 
     @staticmethod
     def _fill(
-        predictions: list[Prediction | None], tracks: Sequence[Track], rows: list[int], arrays: _Arrays, fallback: bool
+        predictions: list[Prediction | None],
+        tracks: Sequence[Track],
+        rows: list[int],
+        arrays: _Arrays,
+        risks: Sequence[tuple[float, float | None]],
+        fallback: bool,
     ) -> None:
         """Puts the arrays' predictions in the places of their tracks."""
         counts = (arrays.probabilities > 0).sum(axis=1).tolist()  # they fall, so the zeros come last
-        mixtures = zip(arrays.weights, arrays.means_m, arrays.sigmas_m, arrays.rhos, strict=True)
-        everything = zip(rows, counts, arrays.probabilities.tolist(), arrays.paths_m, mixtures, strict=True)
-        for row, count, probabilities, points, mixture in everything:
+        means = arrays.means_m.astype(np.float32)
+        mixtures = zip(arrays.weights, means, arrays.sigmas_m, arrays.rhos, strict=True)
+        everything = zip(rows, counts, arrays.probabilities.tolist(), arrays.paths_m, mixtures, risks, strict=True)
+        for row, count, probabilities, points, mixture, risk in everything:
             paths = tuple(map(ModalPath, probabilities[:count], points))
-            predictions[row] = Prediction(tracks[row].id, fallback, paths, Mixture(*mixture))
+            predictions[row] = Prediction(tracks[row].id, fallback, paths, Mixture(*mixture), *risk)
 
 
 def excess(covariances: FloatArray) -> FloatArray:
@@ -139,6 +169,17 @@ def excess(covariances: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(covariances)
     more = np.maximum(values - USUAL_SIGMA_M**2, 0)  # (A, 2)
     return np.asarray((vectors * more[:, None]) @ vectors.swapaxes(1, 2))
+
+
+def _risks(
+    corridor: Corridor | None, states: FloatArray, covariances: FloatArray, arrays: _Arrays
+) -> list[tuple[float, float | None]]:
+    """(A, 4), (A, 4, 4) -> the probability of entering the corridor and the time to it, of each pedestrian."""
+    if corridor is None:
+        return [(0.0, None)] * len(states)
+    futures = Futures(states[:, :2], covariances[:, :2, :2], **vars(arrays))
+    probabilities, times_s = entries(corridor, futures)
+    return [(p, t if p > 0 else None) for p, t in zip(probabilities.tolist(), times_s.tolist(), strict=True)]
 
 
 def _require_finite(tracks: Sequence[Track], *arrays: FloatArray) -> None:
@@ -157,7 +198,7 @@ def _fallback(states: FloatArray, covariances: FloatArray, dt_s: float, steps: i
         probabilities=np.ones((len(states), 1)),
         paths_m=path[:, None],
         weights=np.ones((len(states), steps, 1), np.float32),
-        means_m=path[:, :, None].astype(np.float32),
+        means_m=path[:, :, None],
         sigmas_m=sigmas[:, :, None].astype(np.float32),
         rhos=rhos[..., None].astype(np.float32),
     )

@@ -11,12 +11,12 @@ fusion's own matches fail.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from replay.reprojection import reproject
+from replay.roles import Roles
 from replay.time_sync import SyncedFrame
 from schemas.messages import BoolArray, FloatArray, IntArray
 from tracking.camera import CameraModel
@@ -182,10 +182,11 @@ class CameraWatch:
             return None
         return math.remainder(yaw - last[2], 2 * math.pi) / ((stamp_ns - last[1]) * 1e-9)
 
-    def checks(self, topic_of: Mapping[str, str]) -> tuple[CameraCheck, ...]:
-        """Returns a check of each camera that had detections; `topic_of` is `Roles.topic_of`."""
+    def checks(self, roles: Roles) -> tuple[CameraCheck, ...]:
+        """Returns a check of each camera that had detections."""
         return tuple(
-            _check(name, topic_of[f"/gmsl/{name}/detections"], camera) for name, camera in sorted(self._cameras.items())
+            _check(name, roles.topics("camera", camera=name)[0], camera)
+            for name, camera in sorted(self._cameras.items())
         )
 
 

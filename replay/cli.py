@@ -4,34 +4,50 @@ import json
 import os
 import signal
 import sys
+from contextlib import ExitStack
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from replay import cli_data, cli_inspect, cli_label, cli_models
+from pcgan.node_health import DEFAULT_DEADLINE_MS
+from replay import cli_data, cli_export, cli_inspect, cli_label, cli_models, cli_play, cli_track, cli_whatif
 from replay.cli_common import (
     DRIVES,
     EXIT_ERROR,
     EXIT_REFUSED,
+    LIVE,
     Duration,
     Log,
-    Remaps,
+    PedestrianLabels,
+    ProfileFile,
+    RoleOptions,
     Salvage,
-    SettingsFile,
     Start,
     Strict,
     TimeOffsets,
+    Tracks,
     console,
     errors,
     fail,
     progress,
-    read_settings,
     refuse_unwritable,
-    remaps,
-    with_time_offsets,
+    settings_of,
     write_json,
+)
+from replay.cli_live import (
+    Connect,
+    Deadline,
+    Listen,
+    Namespace,
+    Ros2Domain,
+    ZenohConfig,
+    health_line,
+    live_session,
+    place,
+    status_line,
+    warn_of_others,
 )
 from replay.errors import ReplayError
 from replay.frame_result import FrameResult
@@ -75,6 +91,12 @@ def replay(
         typer.Option("--output", "-o", metavar="OUT.mcap", help="Predictions go here. [default: LOG.pcgan.mcap]"),
     ] = None,
     merge: Annotated[bool, typer.Option("--merge", metavar="", help="Copy the recording into OUT.mcap, too.")] = False,
+    emit: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME", help="Write these forms only: pcgan, foxglove, autoware. [default: the first two]"
+        ),
+    ] = None,
     rrd: Annotated[Path | None, typer.Option("--rrd", metavar="FILE", help="Write a rerun recording, too.")] = None,
     view: Annotated[bool, typer.Option("--view", metavar="", help="Open the rerun viewer and watch.")] = False,
     picture: Annotated[
@@ -83,7 +105,7 @@ def replay(
     summary: Annotated[
         Path | None, typer.Option("--json", metavar="SUMMARY.json", help="Write the summary as JSON.")
     ] = None,
-    start: Start = 0,
+    start: Start = None,
     duration: Duration = None,
     predictor: Annotated[
         PredictorMode, typer.Option(help="A process of its own, one already running, or this process.")
@@ -105,9 +127,11 @@ def replay(
     ] = None,
     strict: Strict = False,
     salvage: Salvage = False,
-    topic: Remaps = None,
+    tracks: Tracks = None,
+    role: RoleOptions = None,
+    pedestrian_label: PedestrianLabels = None,
     time_offset: TimeOffsets = None,
-    settings_file: SettingsFile = None,
+    profile: ProfileFile = None,
 ) -> None:
     """Replay a drive: track its pedestrians, predict them, write the predictions.
 
@@ -121,17 +145,21 @@ def replay(
 
     pcgan replay drive.mcap --horizon 3
 
+    pcgan replay drive.mcap --tracks /perception/tracked_objects --emit autoware
+
     pcgan replay drive.mcap --predictor external --connect tcp/127.0.0.1:7447
 
-    **Exit codes**: 0 all well, 2 an error, 3 messages were refused or lost, 130 Ctrl-C.
+    **Exit codes**: 0 all well, 2 an error, 3 messages were refused or lost, 130 Ctrl-C, 143 SIGTERM.
     """
+    from replay.log_writer import DEFAULT_FORMATS
     from replay.picture import BusiestMoment, draw_top_down
     from replay.rerun_view import NullView, RerunView
     from replay.session import PredictorChoice, Replay
     from replay.summary_table import print_summary
 
-    if connect and predictor is not PredictorMode.external:
-        fail("--connect goes with --predictor external")
+    for option, value in (("--connect", connect), ("--zenoh-config", zenoh_config), ("--namespace", namespace)):
+        if value and predictor is not PredictorMode.external:
+            fail(f"{option} goes with --predictor external")
     if predictor is PredictorMode.external and (model is not None or horizon is not None):
         fail(f"{'--model' if model is not None else '--horizon'}: an external predictor has its own weights")
     if predictor is PredictorMode.external and not (connect or zenoh_config):
@@ -143,14 +171,22 @@ def replay(
     output = output or logs[0].with_name(f"{logs[0].stem}.pcgan.mcap")
     refuse_overwriting(logs, *(path for path in (output, rrd, picture, summary) if path is not None))
     refuse_unwritable(rrd, picture, summary)
-    given = {"start_s": start or None, "duration_s": duration, "topics": remaps(topic) or None}
-    settings = read_settings(settings_file).model_copy(update={k: v for k, v in given.items() if v is not None})
-    settings = with_time_offsets(settings, time_offset)
+    settings = settings_of(
+        profile,
+        start=start,
+        duration=duration,
+        roles=role,
+        tracks=tracks,
+        time_offsets=time_offset,
+        pedestrian_labels=pedestrian_label,
+    )
     choice = PredictorChoice(predictor.value, _chosen(model, horizon), connect, zenoh_config, namespace)
     images = rrd is not None or view
     run = Replay(logs, settings, choice, window=window, rate=rate, strict=strict, salvage=salvage, images=images)
     for name in run.roles.missing:
         errors.print(f"note: the log has no {name}", markup=False)
+    if predictor is PredictorMode.external:
+        errors.print(f"looking for a predictor on {connect or zenoh_config}", markup=False)
     recording_id = "+".join(path.stem for path in logs)
     shown = RerunView.to_file(rrd, recording_id) if rrd else RerunView.spawn(recording_id) if view else NullView()
     busiest = BusiestMoment()
@@ -163,7 +199,9 @@ def replay(
                 busiest.offer(result)
 
         try:
-            done = record(run, output, shown, merge=merge, on_frame=on_frame)
+            done = record(
+                run, output, shown, merge=merge, emit=tuple(emit) if emit else DEFAULT_FORMATS, on_frame=on_frame
+            )
         except Interrupted as interruption:  # before the first frame: there is nothing to close
             raise typer.Exit(128 + interruption.signum) from None
     written = [output]
@@ -194,6 +232,9 @@ def simulate(
         float | None, typer.Option(min=0.5, metavar="S", help="[default: 60 of a crowd, all of a clip]")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, metavar="N", help="Of the crowd and of all sensor noise.")] = 0,
+    points: Annotated[
+        bool, typer.Option("--points", metavar="", help="Write the LiDAR's points, too: 4 MB a second.")
+    ] = False,
 ) -> None:
     """Simulate a USyd-style drive: six fisheye cameras, a VLP-16, odometry, and the truth.
 
@@ -204,6 +245,8 @@ def simulate(
     pcgan simulate drive.mcap --clip dut/intersection_08 --vehicle 2
 
     pcgan simulate drive.mcap --clip my.csv
+
+    pcgan simulate drive.mcap --duration 20 --points
     """
     from pcgan.clips import ClipError, DataNotFound
     from replay.simulator import SimulationError
@@ -219,6 +262,7 @@ def simulate(
                 pedestrians=pedestrians,
                 duration_s=duration,
                 seed=seed,
+                points=points,
                 progress=lambda fraction: bar.update(task, completed=fraction),
             )
         except (SimulationError, ClipError, DataNotFound) as error:
@@ -228,21 +272,19 @@ def simulate(
     typer.echo(f"{output}: {drive.duration_s:.1f} s of {drive.motion}, {drive.pedestrians} people, {drive.scans} scans")
 
 
-@app.command(rich_help_panel=DRIVES)
+@app.command(rich_help_panel=LIVE)
 def predict(
     model: Model = None,
     horizon: Horizon = None,
-    listen: Annotated[
-        str | None, typer.Option(metavar="ENDPOINT", help="Listen here. [default: tcp/127.0.0.1:7447]")
-    ] = None,
-    connect: Annotated[str | None, typer.Option(metavar="ENDPOINT", help="Connect here instead.")] = None,
-    zenoh_config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="zenoh configuration: TLS, access control, other networks.")
-    ] = None,
-    namespace: Annotated[str, typer.Option(metavar="TEXT", help="Prefix of the zenoh keys.")] = "",
+    listen: Listen = None,
+    connect: Connect = None,
+    zenoh_config: ZenohConfig = None,
+    namespace: Namespace = "",
+    ros2_domain: Ros2Domain = None,
+    deadline_ms: Deadline = DEFAULT_DEADLINE_MS,
     spawned: Annotated[bool, typer.Option("--spawned", hidden=True)] = False,
 ) -> None:
-    """Serve predictions over zenoh until Ctrl-C: pcgan/tracks in, pcgan/predictions out.
+    """Serve predictions over zenoh until Ctrl-C: pcgan/tracks in, pcgan/predictions out, queries on pcgan/predict.
 
     **Examples**
 
@@ -251,24 +293,47 @@ def predict(
     pcgan predict --horizon 3
 
     pcgan predict --listen tcp/127.0.0.1:7450 --model my.safetensors
+
+    pcgan predict --ros2-domain 0
     """
     from pcgan import bus
-    from pcgan.checkpoint import CheckpointError, find_model
-    from pcgan.predictor import Predictor
-    from pcgan.predictor_process import run
 
-    listening = [listen] if listen else [] if connect or zenoh_config else [bus.DEFAULT_ENDPOINT]
-    try:
-        predictor = Predictor.from_checkpoint(find_model(_chosen(model, horizon)))
-        session = bus.open_session(listen=listening, connect=[connect] if connect else [], config_file=zenoh_config)
-    except (CheckpointError, bus.BusError) as error:
-        fail(str(error))
-    identity = bus.ModelIdentity(predictor.model_name, predictor.checksum)
-    if not spawned:
-        where = ", ".join(listening) or connect or str(zenoh_config)
-        errors.print(f"serving {identity.name} on {where}; Ctrl-C ends it", markup=False)
-    refused = run(session, predictor, identity, namespace=namespace, end_with_stdin=spawned)
-    session.close()  # type: ignore[no-untyped-call]
+    with ExitStack() as ends:
+        if spawned:
+            session = ends.enter_context(bus.open_session(connect=[connect] if connect else []))
+        else:  # before the weights are loaded, which takes a while: who is started first listens
+            session = ends.enter_context(live_session(listen, connect, zenoh_config, ros2_domain))
+        from pcgan.checkpoint import CheckpointError, find_model
+        from pcgan.predictor import Predictor
+        from pcgan.predictor_process import run
+
+        try:
+            predictor = Predictor.from_checkpoint(find_model(_chosen(model, horizon)))
+        except CheckpointError as error:
+            fail(str(error))
+        identity = bus.ModelIdentity(predictor.model_name, predictor.checksum)
+        if not spawned:
+            warn_of_others(session, bus.any_alive_key(namespace), "a predictor", "every frame is answered twice")
+            where = place(listen, connect, zenoh_config, ros2_domain)
+            errors.print(f"serving {identity.name} on {where}; Ctrl-C ends it", markup=False)
+        on_answer = None
+        if ros2_domain is not None:
+            from replay.ros2_bus import Ros2Node
+            from replay.ros2_nodes import Ros2Predictions
+
+            node = ends.enter_context(Ros2Node(session, ros2_domain, "pcgan_predict"))
+            on_answer = Ros2Predictions(node, session, namespace).put
+        say = ends.enter_context(status_line())
+        refused = run(
+            session,
+            predictor,
+            identity,
+            namespace=namespace,
+            deadline_ms=deadline_ms,
+            end_with_stdin=spawned,
+            on_answer=on_answer,
+            on_health=lambda health: say(health_line(health)),
+        )
     if refused and not spawned:
         errors.print(f"{refused} malformed messages were refused", markup=False)
         raise typer.Exit(EXIT_REFUSED)
@@ -278,7 +343,9 @@ def predict(
 def info(
     logs: Log,
     salvage: Salvage = False,
-    topic: Remaps = None,
+    role: RoleOptions = None,
+    pedestrian_label: PedestrianLabels = None,
+    profile: ProfileFile = None,
     seconds: Annotated[float, typer.Option(min=0.1, metavar="S", help="How much of the log to time.")] = 60,
     as_json: Annotated[bool, typer.Option("--json", metavar="", help="Print JSON instead of a table.")] = False,
 ) -> None:
@@ -288,20 +355,27 @@ def info(
 
     pcgan info drive.mcap
 
+    pcgan info drive.mcap --role pose:=/odom --role camera:=/front/detections
+
     pcgan info drive.mcap --json | jq .topics
     """
     from replay.log_info import describe_log, print_info
 
-    description = describe_log(logs, remaps(topic), salvage=salvage, seconds=seconds)
+    settings = settings_of(profile, roles=role, pedestrian_labels=pedestrian_label)
+    description = describe_log(logs, settings, salvage=salvage, seconds=seconds)
     if as_json:
         typer.echo(json.dumps(description, indent=2))
     else:
-        print_info(description, console(minimum_width=120))
+        print_info(description, console(minimum_width=170))
     raise typer.Exit(0 if description["usable"] else EXIT_ERROR)
 
 
 app.add_typer(cli_inspect.app)
+app.add_typer(cli_track.app)
 app.add_typer(cli_label.app)
+app.add_typer(cli_export.app)
+app.add_typer(cli_whatif.app)
+app.add_typer(cli_play.app)
 app.add_typer(cli_models.app)
 app.add_typer(cli_data.app, rich_help_panel="Data")
 

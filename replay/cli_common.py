@@ -1,6 +1,7 @@
 """What every command shares: options, one-line errors, exit codes, consoles, the progress bar, files on the side."""
 
 import json
+import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,9 +10,13 @@ from typing import Annotated, NoReturn
 import typer
 from pydantic import ValidationError
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from replay.class_labels import unmatched_line
+from replay.errors import refused_line
 from replay.interrupts import Interrupted, Interrupts
+from replay.roles import SCANS
 from replay.session import Replay, ReplaySettings
 from replay.time_sync import SyncSettings
 
@@ -19,17 +24,31 @@ errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 EXIT_ERROR = 2  # a mistake that the user can mend: one line says which
 EXIT_REFUSED = 3  # the run went through, but messages were refused or a damaged file lost some
-DRIVES = "Drives"  # a panel of the help
+DRIVES, LIVE = "Drives", "Live"  # panels of the help
 
 # options that several commands have
 Log = Annotated[list[Path], typer.Argument(metavar="LOG.mcap", help="The recording, in one file or several.")]
-Remaps = Annotated[
+RoleOptions = Annotated[
     list[str] | None,
-    typer.Option("--topic", metavar="NAME:=NAME", help="Read a topic under another name, e.g. /vn100/odometry:=/odom."),
+    typer.Option(
+        "--role", metavar="ROLE:=TOPIC", help="Give a topic a role, e.g. pose:=/odom; pcgan info tells which."
+    ),
 ]
-Start = Annotated[float, typer.Option(min=0, metavar="S", help="Begin this many seconds into the log.")]
+Tracks = Annotated[
+    str | None,
+    typer.Option(metavar="TOPIC", help="Take another tracker's tracks instead of ours; same as --role tracks:=TOPIC."),
+]
+Start = Annotated[
+    float | None, typer.Option(min=0, max=1e9, metavar="S", help="Begin this many seconds into the log. [default: 0]")
+]
 Duration = Annotated[
-    float | None, typer.Option(min=0.001, metavar="S", help="Stop after this many seconds. [default: all]")
+    float | None, typer.Option(min=0.001, max=1e9, metavar="S", help="Stop after this many seconds. [default: all]")
+]
+PedestrianLabels = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--pedestrian-label", metavar="NAME", help="Class name or id that means a pedestrian; replaces the usual names."
+    ),
 ]
 Strict = Annotated[bool, typer.Option("--strict", metavar="", help="Stop at the first message that is refused.")]
 Salvage = Annotated[bool, typer.Option("--salvage", metavar="", help="Read every intact chunk of a damaged file.")]
@@ -39,9 +58,11 @@ TimeOffsets = Annotated[
         "--time-offset", metavar="NAME:=MS", help="Add ms to a topic's stamps, e.g. /gmsl/A1/detections:=-80."
     ),
 ]
-SettingsFile = Annotated[
+ProfileFile = Annotated[
     Path | None,
-    typer.Option("--settings", metavar="FILE", help="Settings as JSON, such as an output's settings.json."),
+    typer.Option(
+        "--profile", metavar="FILE", help="Roles and settings as TOML or JSON, e.g. an output's settings.json."
+    ),
 ]
 
 
@@ -101,8 +122,9 @@ def closing_lines(run: Replay, written: Sequence[Path], out: Console) -> int:
     for line in refused.first[:5] + losses[:5]:
         out.print(line, markup=False)
     if refused.total:
-        were = "message was" if refused.total == 1 else "messages were"
-        out.print(f"[yellow]{refused.total} {were} refused[/]; --json lists them by topic and reason")
+        out.print(refused_line(refused.total))
+    if run.labels.unmatched:
+        out.print(f"[yellow]{escape(unmatched_line(run.labels.unmatched))}[/]")
     if losses:
         out.print("[yellow]the file is damaged[/]; every intact chunk was used")
     for path in written:
@@ -110,19 +132,45 @@ def closing_lines(run: Replay, written: Sequence[Path], out: Console) -> int:
     return EXIT_REFUSED if refused.total or losses else 0
 
 
-def remaps(options: list[str] | None) -> dict[str, str]:
-    """Reads NAME:=NAME options."""
-    names = {}
-    for option in options or ():
-        default, separator, name = option.partition(":=")
-        if not separator or not default or not name:
-            fail(f"--topic wants NAME:=NAME, for example /vn100/odometry:=/odom; got {option!r}")
-        names[default] = name
-    return names
+def settings_of(
+    profile: Path | None,
+    *,
+    start: float | None = None,
+    duration: float | None = None,
+    roles: list[str] | None = None,
+    tracks: str | None = None,
+    time_offsets: list[str] | None = None,
+    pedestrian_labels: list[str] | None = None,
+) -> ReplaySettings:
+    """Returns the settings of a run: the profile's, with options in their place."""
+    settings = read_profile(profile)
+    given = {"start_s": start, "duration_s": duration}
+    settings = settings.model_copy(update={name: value for name, value in given.items() if value is not None})
+    settings = _with_time_offsets(_with_roles(settings, roles, tracks), time_offsets)
+    if not pedestrian_labels:
+        return settings
+    fusion = settings.tracking.fusion.model_copy(update={"pedestrian_labels": tuple(pedestrian_labels)})
+    tracking = settings.tracking.model_copy(update={"fusion": fusion})
+    return settings.model_copy(update={"tracking": tracking})
 
 
-def with_time_offsets(settings: ReplaySettings, options: list[str] | None) -> ReplaySettings:
-    """Returns the settings with NAME:=MS options in them, which go before those of the same name there."""
+def _with_roles(settings: ReplaySettings, options: list[str] | None, tracks: str | None) -> ReplaySettings:
+    """Puts ROLE:=TOPIC options into the settings."""
+    roles = settings.roles
+    if any(option.partition(":=")[0].partition(".")[0] == "camera" for option in options or ()):
+        roles = roles.model_copy(update={"cameras": None})  # cameras named here are all there are
+    for option in [*(options or ()), *([f"tracks:={tracks}"] if tracks is not None else [])]:
+        role, separator, topic = option.partition(":=")
+        if not separator or not role or not topic:
+            fail(f"--role wants ROLE:=TOPIC, for example pose:=/odom; got {option!r}")
+        if role in SCANS:
+            roles = roles.model_copy(update=dict.fromkeys(SCANS))
+        roles = roles.with_role(role, topic)
+    return settings.model_copy(update={"roles": roles})
+
+
+def _with_time_offsets(settings: ReplaySettings, options: list[str] | None) -> ReplaySettings:
+    """Puts NAME:=MS options into the settings, where they go before those of the same name there."""
     offsets_ms = dict(settings.sync.time_offset_ms)
     for option in options or ():
         name, _, offset_ms = option.partition(":=")
@@ -138,15 +186,20 @@ def with_time_offsets(settings: ReplaySettings, options: list[str] | None) -> Re
     return settings
 
 
-def read_settings(path: Path | None) -> ReplaySettings:
-    """Reads settings from a JSON file; what it leaves out keeps its default."""
+def read_profile(path: Path | None) -> ReplaySettings:
+    """Reads roles and settings from a TOML or JSON file; what it leaves out keeps its default."""
     if path is None:
         return ReplaySettings()
     try:
-        return ReplaySettings.model_validate_json(path.read_bytes())
+        text = path.read_text()
+        plain = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+        return ReplaySettings.model_validate_json(json.dumps(plain, default=str))
     except OSError as error:
         fail(f"{path} cannot be read: {error.strerror or error}")
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the file"
-        fail(f"{path} does not hold replay settings: {where}: {first['msg']}")
+        fail(f"{path} is no profile: {where}: {first['msg']}")
+    except ValueError as error:  # of both parsers
+        kind = "JSON" if path.suffix == ".json" else "TOML"
+        fail(f"{path} is not {kind}: {error}")

@@ -12,9 +12,10 @@ from replay.cli_common import (
     DRIVES,
     Duration,
     Log,
-    Remaps,
+    PedestrianLabels,
+    ProfileFile,
+    RoleOptions,
     Salvage,
-    SettingsFile,
     Start,
     TimeOffsets,
     closing_lines,
@@ -23,11 +24,9 @@ from replay.cli_common import (
     errors,
     fail,
     progress,
-    read_settings,
     refuse_unwritable,
     refused_figures,
-    remaps,
-    with_time_offsets,
+    settings_of,
     write_json,
 )
 
@@ -47,7 +46,7 @@ def inspect(
         float | None, typer.Option(min=0, metavar="S", help="Take the frame nearest this time apart.")
     ] = None,
     frames: Annotated[bool, typer.Option("--frames", metavar="", help="Take every frame apart.")] = False,
-    start: Start = 0,
+    start: Start = None,
     duration: Duration = None,
     as_json: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write all of it as JSON, every frame included.")
@@ -56,9 +55,10 @@ def inspect(
         Path | None, typer.Option("--rrd", metavar="FILE", help="Draw it all into a rerun recording.")
     ] = None,
     salvage: Salvage = False,
-    topic: Remaps = None,
+    role: RoleOptions = None,
+    pedestrian_label: PedestrianLabels = None,
     time_offset: TimeOffsets = None,
-    settings_file: SettingsFile = None,
+    profile: ProfileFile = None,
 ) -> None:
     """Say why pedestrians were missed, and check a recording's stamps and camera mounts.
 
@@ -89,13 +89,19 @@ def inspect(
     written = [path for path in (as_json, rrd) if path is not None]
     refuse_overwriting(logs, *written)
     refuse_unwritable(*written)
-    given = {"start_s": start or None, "duration_s": duration, "topics": remaps(topic) or None}
-    settings = read_settings(settings_file).model_copy(update={k: v for k, v in given.items() if v is not None})
+    settings = settings_of(
+        profile,
+        start=start,
+        duration=duration,
+        roles=role,
+        time_offsets=time_offset,
+        pedestrian_labels=pedestrian_label,
+    )
     if at is not None:
         if at < settings.start_s:
             fail(f"--at {at:g} lies before the start, {settings.start_s:g} s into the log")
         settings = settings.model_copy(update={"duration_s": at - settings.start_s + AFTER_S})
-    run = Replay(logs, with_time_offsets(settings, time_offset), salvage=salvage, images=rrd is not None)
+    run = Replay(logs, settings, salvage=salvage, images=rrd is not None)
     for name in run.roles.missing:
         errors.print(f"note: the log has no {name}", markup=False)
     whole = not frames and at is None
@@ -113,7 +119,7 @@ def inspect(
         stamps = check_stamps(run.reader, run.roles, run.settings.sync, run.offsets_ns) if whole else None
     figures: dict[str, Any] = {"files": [path.name for path in logs], "frames": kept, **refused_figures(run)}
     if stamps is not None:
-        recording, summary = report(stamps, watch.checks(run.roles.topic_of)), log.summary()
+        recording, summary = report(stamps, watch.checks(run.roles)), log.summary()
         print_recording(recording, out)
         print_summary(summary, out)
         figures |= {"recording": _plain(recording), "summary": _plain(summary)}

@@ -12,9 +12,10 @@ from replay.cli_common import (
     DRIVES,
     Duration,
     Log,
-    Remaps,
+    PedestrianLabels,
+    ProfileFile,
+    RoleOptions,
     Salvage,
-    SettingsFile,
     Start,
     Strict,
     TimeOffsets,
@@ -24,11 +25,9 @@ from replay.cli_common import (
     errors,
     fail,
     progress,
-    read_settings,
     refuse_unwritable,
     refused_figures,
-    remaps,
-    with_time_offsets,
+    settings_of,
     write_json,
 )
 from replay.label_score import Scores
@@ -48,7 +47,7 @@ def label(
     summary: Annotated[
         Path | None, typer.Option("--json", metavar="SUMMARY.json", help="Write the summary as JSON.")
     ] = None,
-    start: Start = 0,
+    start: Start = None,
     duration: Duration = None,
     min_duration: Annotated[float, typer.Option(min=0, metavar="S", help="Leave shorter trajectories out.")] = 1.0,
     min_hits: Annotated[int, typer.Option(min=1, metavar="N", help="Leave out those of fewer measurements.")] = 5,
@@ -57,9 +56,10 @@ def label(
     ] = 0.5,
     strict: Strict = False,
     salvage: Salvage = False,
-    topic: Remaps = None,
+    role: RoleOptions = None,
+    pedestrian_label: PedestrianLabels = None,
     time_offset: TimeOffsets = None,
-    settings_file: SettingsFile = None,
+    profile: ProfileFile = None,
 ) -> None:
     """Label a drive: write its pedestrians' smoothed trajectories, to train on or to simulate again.
 
@@ -90,9 +90,14 @@ def label(
         fail(f"{output} needs the package pyarrow, which is not installed; .csv and .csv.gz need none")
     refuse_overwriting(logs, output, part_of(output), *([] if summary is None else [summary]))
     refuse_unwritable(output, summary)
-    given = {"start_s": start or None, "duration_s": duration, "topics": remaps(topic) or None}
-    settings = read_settings(settings_file).model_copy(update={k: v for k, v in given.items() if v is not None})
-    settings = with_time_offsets(settings, time_offset)
+    settings = settings_of(
+        profile,
+        start=start,
+        duration=duration,
+        roles=role,
+        time_offsets=time_offset,
+        pedestrian_labels=pedestrian_label,
+    )
     wanted = LabelSettings(min_duration_s=min_duration, min_hits=min_hits, max_gap_s=max_gap)
     run = Replay(logs, settings, strict=strict, salvage=salvage)
     for name in run.roles.missing:

@@ -5,15 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pcgan import vehicle_path
 from schemas.messages import FloatArray, IntArray, Prediction, PredictionFrame, TrackFrame
 from tracking.sensor_frame import CameraFrame
 
 PERSON_RADIUS_M = 0.3
 PERSON_HEIGHT_M = 1.75
-VEHICLE_LENGTH_M = 3.0  # the USyd vehicle is a small electric van; base_link under its rear axle
-VEHICLE_WIDTH_M = 1.4
-VEHICLE_HEIGHT_M = 1.9
-VEHICLE_CENTRE_M = 0.9  # from base_link forward
+VEHICLE_LENGTH_M, VEHICLE_WIDTH_M, VEHICLE_HEIGHT_M = vehicle_path.LENGTH_M, vehicle_path.WIDTH_M, 1.9
+VEHICLE_CENTRE_M = vehicle_path.CENTRE_M  # from base_link forward
 _RING = np.linspace(0, 2 * np.pi, 8, endpoint=False)
 _CYLINDER = np.array(
     [(PERSON_RADIUS_M * np.cos(a), PERSON_RADIUS_M * np.sin(a), z) for z in (0.0, PERSON_HEIGHT_M) for a in _RING]

@@ -49,3 +49,9 @@ class Refusals:
     def as_json(self) -> list[dict[str, object]]:
         """Returns one row per topic and reason, sorted."""
         return [{"topic": topic, "reason": kind, "count": n} for (topic, kind), n in sorted(self.counts.items())]
+
+
+def refused_line(count: int) -> str:
+    """Returns what is said of refused messages at the end."""
+    were = "message was" if count == 1 else "messages were"
+    return f"[yellow]{count} {were} refused[/]; --json lists them by topic and reason"

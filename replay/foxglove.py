@@ -15,17 +15,33 @@ from foxglove_schemas_protobuf import (
     FrameTransform_pb2,
     FrameTransforms_pb2,
     Odometry_pb2,
+    PackedElementField_pb2,
+    PointCloud_pb2,
     PoseInFrame_pb2,
 )
 from google.protobuf.message import DecodeError, Message
 
-from schemas.codec import CodecError, unit_quaternion
-from schemas.messages import CameraCalibration, CompressedImage, FloatArray, Transform, VehiclePose
+from replay.lens_models import lens
+from replay.point_fields import points_from_fields
+from schemas.codec import LARGEST, CodecError, unit_quaternion
+from schemas.messages import CameraCalibration, CompressedImage, FloatArray, PointCloud, Transform, VehiclePose
+from tracking import geometry
 
 NS_PER_S = 1_000_000_000
+_LAST_NS = 2**63 - 1  # what 64 bits hold; a sender's garbage may be more
 # Foxglove's name for OpenCV's fisheye model; ROS, and our dataclasses, say equidistant.
 _FOXGLOVE_MODELS = {"equidistant": "kannala_brandt"}
-_OUR_MODELS = {theirs: ours for ours, theirs in _FOXGLOVE_MODELS.items()}
+_Field = PackedElementField_pb2.PackedElementField
+_DTYPES = {
+    _Field.UINT8: "<u1",
+    _Field.INT8: "<i1",
+    _Field.UINT16: "<u2",
+    _Field.INT16: "<i2",
+    _Field.UINT32: "<u4",
+    _Field.INT32: "<i4",
+    _Field.FLOAT32: "<f4",
+    _Field.FLOAT64: "<f8",
+}  # little-endian always, as Foxglove says
 
 
 def encode(message: object) -> bytes:
@@ -47,6 +63,8 @@ def to_protobuf(message: object) -> Message:
         return _image(message)
     if isinstance(message, VehiclePose):
         return _odometry(message)
+    if isinstance(message, PointCloud):
+        return _point_cloud(message)
     if isinstance(message, Sequence) and all(isinstance(item, Transform) for item in message):
         return FrameTransforms_pb2.FrameTransforms(transforms=map(_frame_transform, message))
     raise TypeError(f"{type(message).__name__} has no Foxglove protobuf here")
@@ -63,15 +81,20 @@ def pose_in_frame(pose: VehiclePose) -> Message:
 def decode(schema_name: str, data: bytes) -> Any:
     """Returns what a Foxglove message holds, checked, by the schema's full name (a key of `DECODERS`).
 
-    CameraCalibration, CompressedImage and VehiclePose come as themselves; FrameTransform and FrameTransforms both
-    as a tuple of Transform. Raises CodecError naming the field that is wrong, KeyError for another schema.
+    CameraCalibration, CompressedImage, PointCloud and VehiclePose come as themselves; FrameTransform and
+    FrameTransforms both as a tuple of Transform. Raises CodecError naming the field that is wrong, KeyError for
+    another schema.
     """
-    protobuf_type, decoder = DECODERS[schema_name]
     try:
-        message = protobuf_type.FromString(data)
+        message = DECODERS[schema_name][0].FromString(data)
     except DecodeError as error:
         raise CodecError(f"not a {schema_name}: {error}") from error
-    return decoder(message)
+    return from_protobuf(message)
+
+
+def from_protobuf(message: Message) -> Any:
+    """Returns what a Foxglove message holds, checked, as `decode` does."""
+    return DECODERS[message.DESCRIPTOR.full_name][1](message)
 
 
 # --- encoding ------------------------------------------------------------------------------------------------------
@@ -118,6 +141,19 @@ def _odometry(pose: VehiclePose) -> Message:
     return message
 
 
+def _point_cloud(cloud: PointCloud) -> Message:
+    points = np.asarray(cloud.points_m, "<f4")
+    message = PointCloud_pb2.PointCloud(
+        frame_id=cloud.frame_id,
+        point_stride=3 * points.itemsize,
+        fields=[_Field(name=name, offset=4 * i, type=_Field.FLOAT32) for i, name in enumerate("xyz")],
+        data=points.tobytes(),
+    )
+    message.timestamp.FromNanoseconds(cloud.stamp_ns)
+    message.pose.orientation.w = 1.0
+    return message
+
+
 def _set_pose(message: Any, pose: VehiclePose) -> None:
     _set_vector(message.position, pose.position_m)
     _set_quaternion(message.orientation, pose.quaternion_xyzw)
@@ -140,14 +176,12 @@ def _decode_calibration(message: Any) -> CameraCalibration:
         raise CodecError(f"{name} has no image size ({message.width} x {message.height})")
     if len(message.K) != 9:
         raise CodecError(f"{name}.K has {len(message.K)} entries instead of 9")
-    model = _OUR_MODELS.get(message.distortion_model, message.distortion_model)
     return CameraCalibration(
         _stamp(message, name),
         message.frame_id,
         message.width,
         message.height,
-        model,
-        _finite(message.D, f"{name}.D"),
+        *lens(message.distortion_model, _finite(message.D, f"{name}.D")),
         _finite(message.K, f"{name}.K").reshape(3, 3),
     )
 
@@ -206,19 +240,49 @@ def _decode_pose_in_frame(message: Any) -> VehiclePose:
     )
 
 
+def _decode_point_cloud(message: Any) -> PointCloud:
+    name = "PointCloud"
+    stamp_ns, stride = _stamp(message, name), message.point_stride
+    if stride == 0 or len(message.data) % stride:
+        raise CodecError(f"{name}.data has {len(message.data)} bytes, no multiple of the point_stride {stride}")
+    fields = {}
+    for field in message.fields:
+        if field.type in _DTYPES:
+            fields[field.name] = (field.offset, _DTYPES[field.type])
+        elif field.name in {"x", "y", "z"}:
+            raise CodecError(f"{name}.fields {field.name} has the unknown type {field.type}")
+    points = points_from_fields(message.data, len(message.data) // stride, stride, fields)
+    return PointCloud(stamp_ns, message.frame_id, _moved_by_pose(points, message))
+
+
+def _moved_by_pose(points: FloatArray, message: Any) -> FloatArray:
+    """Returns a cloud's points in its frame_id: they are logged relative to its pose, which may be left out."""
+    if not message.HasField("pose"):
+        return points
+    position = _vector(message.pose.position, "PointCloud.position")
+    quaternion = _quaternion(message.pose.orientation, "PointCloud.orientation")
+    if not position.any() and not quaternion[:3].any():
+        return points
+    return geometry.apply(geometry.transform_matrix(position, quaternion), points)
+
+
 def _stamp(message: Any, name: str, required: bool = True) -> int:
     """Returns the stamp in ns; static transforms may have none, everything else must."""
     stamp: int = message.timestamp.seconds * NS_PER_S + message.timestamp.nanos
     if stamp < 0 or (required and stamp == 0):
         raise CodecError(f"{name} has no stamp (timestamp {stamp} ns)")
+    if stamp > _LAST_NS:
+        raise CodecError(f"{name} has a stamp past the year 2262 (timestamp {stamp} ns)")
     return stamp
 
 
 def _finite(values: Iterable[float], name: str) -> FloatArray:
-    array = np.array(list(values), float)
-    if not np.isfinite(array).all():
+    numbers = list(values)
+    if not all(map(math.isfinite, numbers)):
         raise CodecError(f"{name} holds NaN or infinity")
-    return array
+    if (largest := max(map(abs, numbers), default=0)) > LARGEST:
+        raise CodecError(f"{name} holds {largest:.3g}, more than {LARGEST:g}")
+    return np.array(numbers, float)
 
 
 def _vector(message: Any, name: str) -> FloatArray:
@@ -226,9 +290,7 @@ def _vector(message: Any, name: str) -> FloatArray:
 
 
 def _quaternion(message: Any, name: str) -> FloatArray:
-    if not all(map(math.isfinite, (message.x, message.y, message.z, message.w))):
-        raise CodecError(f"{name} holds NaN or infinity")
-    return unit_quaternion((message.x, message.y, message.z, message.w))
+    return unit_quaternion(_finite((message.x, message.y, message.z, message.w), name))
 
 
 def _twist(message: Any, field: str) -> FloatArray:
@@ -241,6 +303,16 @@ DECODERS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "foxglove.FrameTransform": (FrameTransform_pb2.FrameTransform, _decode_one_transform),
     "foxglove.FrameTransforms": (FrameTransforms_pb2.FrameTransforms, _decode_transforms),
     "foxglove.CompressedImage": (CompressedImage_pb2.CompressedImage, _decode_image),
+    "foxglove.PointCloud": (PointCloud_pb2.PointCloud, _decode_point_cloud),
     "foxglove.PoseInFrame": (PoseInFrame_pb2.PoseInFrame, _decode_pose_in_frame),
     "foxglove.Odometry": (Odometry_pb2.Odometry, _decode_odometry),
 }
+MESSAGES = {
+    "foxglove.CameraCalibration": "CameraCalibration",
+    "foxglove.FrameTransform": "Transform",
+    "foxglove.FrameTransforms": "Transform",
+    "foxglove.CompressedImage": "CompressedImage",
+    "foxglove.PointCloud": "PointCloud",
+    "foxglove.PoseInFrame": "VehiclePose",
+    "foxglove.Odometry": "VehiclePose",
+}  # the dataclass that a message becomes

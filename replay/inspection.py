@@ -10,7 +10,7 @@ from enum import StrEnum
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from replay.pipeline import FrameTracker, amend
+from replay.pipeline import amend
 from replay.score import MIN_LIDAR_POINTS, match
 from replay.session import Replay
 from replay.time_sync import SyncedFrame
@@ -178,7 +178,7 @@ def inspect_frames(run: Replay) -> Iterator[Inspected]:
 
     The first ones warm the tracker up: they lie before `run.start_ns`. Late scans amend the tracks and are not yielded.
     """
-    tracker = FrameTracker(run.settings.tracking)
+    tracker = run.tracker()
     with threadpool_limits(1):  # sums in BLAS depend on how many threads share them
         for frame in run.frames():
             if frame.late:

@@ -12,6 +12,7 @@ from rich.text import Text
 from replay.camera_check import CameraCheck, Estimate
 from replay.inspection import BoxReport, BoxScore, ClusterReport, FrameReport, Miss, NearMiss, Outcome, PersonReport
 from replay.inspection_summary import InspectionSummary, PersonSummary, Spell, UntrackedBoxes, UntrackedCluster
+from replay.log_info import delays_text
 from replay.recording_check import RecordingReport, TopicTiming
 
 MOST_ROWS = 12  # of a list whose tail is seldom read; the JSON has all
@@ -278,7 +279,7 @@ def print_recording(report: RecordingReport, console: Console) -> None:
         console.print(Text("! ", "bold red").append(verdict, "red"), soft_wrap=True)
     if not report.verdicts:
         told = [check.camera for check in report.cameras if check.yaw_deg is not None]
-        has_cameras = any(topic.role == "camera detections" for topic in report.topics)
+        has_cameras = any(topic.role == "camera" for topic in report.topics)
         why = "there are too few boxes on people" if has_cameras else "there are no cameras"
         mounts = f"the mounts of {', '.join(told)}" if told else f"no mount: {why}"
         console.print(f"nothing wrong was found; checked: the stamps, {mounts}", soft_wrap=True)
@@ -290,7 +291,7 @@ def _timing_row(topic: TopicTiming) -> tuple[str, ...]:
         topic.topic,
         _number(topic.rate_hz, ".1f"),
         _number(topic.jitter_ms, ".1f"),
-        _both(topic.delay_ms, ".0f", " / "),
+        "" if topic.delay_ms is None else delays_text(*topic.delay_ms),
         _both(topic.skew_ms, ".1f", " / "),
         _number(topic.scans_with, ".0%"),
         str(topic.gaps),

@@ -18,7 +18,6 @@ from pcgan.clips import TRAJECTORY_SUFFIXES, ClipError
 from pcgan.trajectory_file import LONGEST_GAP_S, TrajectoryRows, write_rows
 from replay.errors import LogError, OutputError, Refusals
 from replay.label_score import LabelScore, Scores
-from replay.pipeline import FrameTracker
 from replay.session import Replay
 from replay.time_sync import SyncedFrame
 from schemas.messages import FloatArray, IntArray
@@ -77,14 +76,14 @@ def label(
 
     Raises LogError if the log cannot be used, if there is nothing to write, or if the clock is set back on the way.
     """
-    tracker, labeller, truth = FrameTracker(run.settings.tracking), _Labeller(settings or LabelSettings()), LabelScore()
+    tracker, labeller, truth = run.tracker(), _Labeller(settings or LabelSettings()), LabelScore()
     epoch: int | None = None  # of the first scan that gets rows
     with threadpool_limits(1):  # sums in BLAS depend on how many threads share them
         for frame in in_order(run.frames(), run.settings.tracking.tracker.ring, run.refusals):
             measurements, _ = tracker.step(frame)
             stamp_ns, wanted = frame.sensors.stamp_ns, frame.log_time_ns >= run.start_ns
             for _ in range(measurements.refused):
-                run.refusals.add("lidar clusters", stamp_ns, "cluster out of reach, or of an impossible shape")
+                run.refusals.add("scans", stamp_ns, "cluster out of reach, or of an impossible shape")
             report = tracker.labels()
             labeller.add(frame, measurements, report, wanted=wanted)
             if wanted:
@@ -113,7 +112,7 @@ def in_order(frames: Iterable[SyncedFrame], depth: int, refusals: Refusals) -> I
             waiting, epoch, last_ns = [], frame.epoch, -1
         stamp_ns = frame.sensors.stamp_ns
         if stamp_ns <= last_ns:
-            refusals.add("lidar clusters", stamp_ns, "scan too late to use")
+            refusals.add("scans", stamp_ns, "scan too late to use")
             continue
         heapq.heappush(waiting, (stamp_ns, frame))
         if len(waiting) > depth:

@@ -10,6 +10,7 @@ import heapq
 import io
 import mmap
 import struct
+import threading
 import zlib
 from bisect import bisect_left
 from collections import Counter
@@ -18,7 +19,7 @@ from dataclasses import dataclass, field
 from itertools import zip_longest
 from operator import attrgetter
 from pathlib import Path
-from typing import IO, NamedTuple, cast
+from typing import IO, cast
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
@@ -28,28 +29,10 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema, Statistics
 from mcap.stream_reader import MAGIC_SIZE, breakup_chunk, get_chunk_data_stream
 
 from replay.errors import LogError
+from replay.logged_message import NO_SCHEMA, ChannelInfo, LoggedSchema, RawMessage
 
 # Files without an index, and damaged ones, come in file order: writers interleave sensors by less than this.
 REORDER_NS = 2_000_000_000
-
-
-class RawMessage(NamedTuple):
-    """One message as it lies in the file."""
-
-    topic: str
-    log_time_ns: int
-    schema_name: str
-    encoding: str
-    data: bytes
-
-
-class ChannelInfo(NamedTuple):
-    """What a file says about one topic."""
-
-    topic: str
-    schema_name: str
-    encoding: str
-    messages: int
 
 
 @dataclass
@@ -82,7 +65,7 @@ class LogReader:
     @property
     def channels(self) -> tuple[ChannelInfo, ...]:
         """The topics of all files, sorted by name; a topic in several files is counted together."""
-        merged: dict[tuple[str, str, str], int] = {}
+        merged: dict[tuple[str, LoggedSchema, str], int] = {}
         for file in self._files:
             for channel in file.channels:
                 key = channel[:3]
@@ -97,10 +80,15 @@ class LogReader:
         return heapq.merge(*streams, key=_log_time)
 
 
-def checksum(path: Path) -> str:
-    """Returns the SHA-256 of a file, in hexadecimal."""
+def checksum(path: Path, abandoned: threading.Event | None = None) -> str | None:
+    """Returns the SHA-256 of a file, in hexadecimal; None if it is abandoned on the way."""
+    digest = hashlib.sha256()
     with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+        while block := stream.read(1 << 20):
+            if abandoned is not None and abandoned.is_set():
+                return None
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def _names(paths: Iterable[Path]) -> str:
@@ -127,7 +115,7 @@ class _IndexedFile:
         self.start_ns = summary.statistics.message_start_time
         self.end_ns = summary.statistics.message_end_time
         self.channels = tuple(
-            ChannelInfo(channel.topic, _schema_name(summary.schemas, channel), channel.message_encoding, count)
+            ChannelInfo(channel.topic, _schema_of(summary.schemas, channel), channel.message_encoding, count)
             for identifier, channel in summary.channels.items()
             if (count := counts.get(identifier, 0))
         )
@@ -148,7 +136,8 @@ class _IndexedFile:
     def _plain(self, stream: IO[bytes]) -> Iterator[RawMessage]:
         """Yields the messages of a file without chunks."""
         records = NonSeekingReader(stream, validate_crcs=True).iter_messages(log_time_order=False)
-        return _reordered(_raw(schema.name if schema else "", channel, message) for schema, channel, message in records)
+        schemas = {number: _schema_of(self._summary.schemas, c) for number, c in self._summary.channels.items()}
+        return _reordered(_raw(schemas[channel.id], channel, message) for _, channel, message in records)
 
     def _chunks(
         self, stream: IO[bytes], topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
@@ -159,7 +148,7 @@ class _IndexedFile:
         a comparison in Python, which costs more than everything else there is to do with it.)
         """
         channels = self._summary.channels
-        names = {identifier: _schema_name(self._summary.schemas, channel) for identifier, channel in channels.items()}
+        schemas = {identifier: _schema_of(self._summary.schemas, channel) for identifier, channel in channels.items()}
         wanted = {identifier for identifier, channel in channels.items() if topics is None or channel.topic in topics}
         chunks = sorted(
             (
@@ -178,7 +167,7 @@ class _IndexedFile:
                 if identifier in wanted:
                     channel = channels[identifier]
                     encoding = channel.message_encoding
-                    waiting.append(RawMessage(channel.topic, log_time_ns, names[identifier], encoding, data))
+                    waiting.append(RawMessage(channel.topic, log_time_ns, schemas[identifier], encoding, data))
             waiting.sort(key=_log_time)
             ready = bisect_left(waiting, following.message_start_time, key=_log_time) if following else len(waiting)
             yield from waiting[:ready]
@@ -222,10 +211,9 @@ class _SalvagedFile:
             losses.notes.append(f"{path.name}: {recorded - counts.total()} of {recorded} recorded messages are missing")
         if undeclared := sum(count for channel, count in counts.items() if channel not in self._channels):
             losses.notes.append(f"{path.name}: {undeclared} messages of topics whose declaration is lost")
+        self._schema_of = {number: _schema_of(self._schemas, channel) for number, channel in self._channels.items()}
         self.channels = tuple(
-            ChannelInfo(
-                channel.topic, _schema_name(self._schemas, channel), channel.message_encoding, counts[identifier]
-            )
+            ChannelInfo(channel.topic, self._schema_of[identifier], channel.message_encoding, counts[identifier])
             for identifier, channel in self._channels.items()
             if counts[identifier]
         )
@@ -234,7 +222,7 @@ class _SalvagedFile:
         self, topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
     ) -> Iterator[RawMessage]:
         raw = (
-            _raw(_schema_name(self._schemas, channel), channel, record)
+            _raw(self._schema_of[record.channel_id], channel, record)
             for record in self._records(Losses())
             if isinstance(record, Message)
             and (channel := self._channels.get(record.channel_id)) is not None
@@ -334,12 +322,18 @@ _CHUNK_HEAD_BYTES = 8 + 8 + 8 + 4  # start, end, uncompressed size, CRC, before 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time, before the data
 _MAGIC = b"\x89MCAP0\r\n"
 _COMPRESSIONS = tuple(struct.pack("<I", len(name)) + name for name in (b"zstd", b"lz4", b""))
+_OTHER_FORMATS = {b"#ROSBAG": "a ROS 1 bag", b"SQLite format 3": "a database, perhaps a ROS 2 bag of the older kind"}
 _log_time = attrgetter("log_time_ns")
 _HINT = "; try --salvage"
 
 
 def _open(path: Path, losses: Losses | None) -> _IndexedFile | _SalvagedFile:
     try:
+        with path.open("rb") as stream:
+            head = stream.read(16)
+        for magic, kind in _OTHER_FORMATS.items():
+            if head.startswith(magic):
+                raise LogError(f"{path} is {kind}, not MCAP: rosbags-convert makes MCAP of it, with --dst-storage mcap")
         return _IndexedFile(path) if losses is None else _SalvagedFile(path, losses)
     except OSError as error:
         raise LogError(f"{path} cannot be read: {error.strerror or error}") from error
@@ -400,13 +394,13 @@ def _damage_named(path: Path, messages: Iterator[RawMessage]) -> Iterator[RawMes
         yield message
 
 
-def _schema_name(schemas: Mapping[int, Schema], channel: Channel) -> str:
+def _schema_of(schemas: Mapping[int, Schema], channel: Channel) -> LoggedSchema:
     schema = schemas.get(channel.schema_id)
-    return schema.name if schema else ""
+    return LoggedSchema(schema.name, schema.encoding, schema.data) if schema else NO_SCHEMA
 
 
-def _raw(schema_name: str, channel: Channel, message: Message) -> RawMessage:
-    return RawMessage(channel.topic, message.log_time, schema_name, channel.message_encoding, message.data)
+def _raw(schema: LoggedSchema, channel: Channel, message: Message) -> RawMessage:
+    return RawMessage(channel.topic, message.log_time, schema, channel.message_encoding, message.data)
 
 
 def _reordered(messages: Iterable[RawMessage]) -> Iterator[RawMessage]:

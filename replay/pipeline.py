@@ -2,23 +2,58 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
 from replay.errors import Refusals
 from replay.frame_result import FrameResult, vehicle_pose
+from replay.object_tracks import ObjectTracksParams, TrackAssembler
 from replay.remote_predictor import AskedPredictor
 from replay.stage_clock import StageClock
 from replay.time_sync import SyncedFrame
 from schemas.messages import PredictionFrame, TrackFrame, VehicleHistory
 from tracking.fusion import Candidate
 from tracking.label_report import LabelReport
-from tracking.measurements import Measurements
+from tracking.measurements import Measurements, empty_measurements
 from tracking.pipeline import TrackingSettings, TrackingStage
 from tracking.tracker import LateScanError
 
 HISTORY_NS = 3_600_000_000
+
+
+class FrameRefused(Exception):
+    """Another tracker's tracks that make no sense."""
+
+
+class FrameStage(Protocol):
+    """What makes track frames of synchronised frames, in order."""
+
+    def step(self, frame: SyncedFrame, *, published: bool = True) -> tuple[Measurements, TrackFrame]:
+        """Returns what was measured and who is there; unpublished frames have no sequence of their own."""
+        ...
+
+    def amend(self, frame: SyncedFrame) -> None:
+        """Takes in a frame that came after its successors; raises LateScanError if that cannot be."""
+        ...
+
+
+class _VehicleTrail:
+    """Where the vehicle has lately been."""
+
+    def __init__(self) -> None:
+        self._states: deque[tuple[int, np.ndarray]] = deque()
+
+    def add(self, frame: SyncedFrame) -> VehicleHistory:
+        """Returns the history up to and with a frame."""
+        stamp_ns = frame.sensors.stamp_ns
+        self._states.append((stamp_ns, frame.vehicle_state))
+        while self._states[0][0] < stamp_ns - HISTORY_NS:
+            self._states.popleft()
+        stamps_ns, states = zip(*self._states, strict=True)
+        return VehicleHistory(np.array(stamps_ns, np.int64), np.array(states))
 
 
 class FrameTracker:
@@ -27,7 +62,7 @@ class FrameTracker:
     def __init__(self, settings: TrackingSettings):
         self._settings = settings
         self._stage = TrackingStage(settings)
-        self._vehicle: deque[tuple[int, np.ndarray]] = deque()
+        self._vehicle = _VehicleTrail()
         self._epoch = 0
         self._sequence = 0
 
@@ -35,16 +70,13 @@ class FrameTracker:
         """Tracks one frame; unpublished ones, which warm the tracker up, have no sequence of their own."""
         sensors = frame.sensors
         self._enter_epoch(frame)
-        self._vehicle.append((sensors.stamp_ns, frame.vehicle_state))
-        while self._vehicle[0][0] < sensors.stamp_ns - HISTORY_NS:
-            self._vehicle.popleft()
+        vehicle = self._vehicle.add(frame)
         result = self._stage.step(sensors)
-        stamps_ns, states = zip(*self._vehicle, strict=True)
         tracks = TrackFrame(
             self._sequence,
             sensors.stamp_ns,
             sensors.frame_id,
-            VehicleHistory(np.array(stamps_ns, np.int64), np.array(states)),
+            vehicle,
             result.tracks,
             sensors.pose_extrapolated,
             frame.epoch,
@@ -55,7 +87,7 @@ class FrameTracker:
     def _enter_epoch(self, frame: SyncedFrame) -> None:
         if frame.epoch != self._epoch:
             self._stage = TrackingStage(self._settings, first_id=self._stage.next_id)  # no id ever means two people
-            self._vehicle.clear()
+            self._vehicle = _VehicleTrail()
             self._epoch = frame.epoch
 
     def explain(self, frame: SyncedFrame) -> tuple[Candidate, ...]:
@@ -73,9 +105,48 @@ class FrameTracker:
             self._stage.amend(frame.sensors)
 
 
+class TrackFollower:
+    """Another tracker's tracks, as track frames with histories: fusion and our tracker are left out."""
+
+    def __init__(self, params: ObjectTracksParams, pedestrian_labels: Collection[str]):
+        self._assembler = TrackAssembler(params, pedestrian_labels)
+        self._vehicle = _VehicleTrail()
+        self._epoch = 0
+        self._sequence = 0
+
+    def step(self, frame: SyncedFrame, *, published: bool = True) -> tuple[Measurements, TrackFrame]:
+        """Returns no measurements, and the tracks; raises FrameRefused if those make no sense."""
+        sensors = frame.sensors
+        if frame.epoch != self._epoch:
+            self._vehicle, self._epoch = _VehicleTrail(), frame.epoch
+        vehicle = self._vehicle.add(frame)
+        if isinstance(frame.objects, TrackFrame):
+            tracks = replace(frame.objects, sequence=self._sequence, epoch=frame.epoch)
+        else:
+            assert frame.objects is not None, "a log of tracks gives frames of tracks"
+            try:
+                tracks = self._assembler.step(
+                    frame.objects,
+                    sensors.map_from_lidar,
+                    vehicle,
+                    sensors.frame_id,
+                    pose_extrapolated=sensors.pose_extrapolated,
+                    epoch=frame.epoch,
+                    sequence=self._sequence,
+                )
+            except ValueError as error:
+                raise FrameRefused(str(error)) from error
+        self._sequence += published
+        return empty_measurements(), tracks
+
+    def amend(self, frame: SyncedFrame) -> None:
+        """Refuses: what another tracker has published cannot be amended."""
+        raise LateScanError(f"tracks of {frame.sensors.stamp_ns} ns came after newer ones")
+
+
 def run_pipeline(
     frames: Iterable[SyncedFrame],
-    tracker: FrameTracker,
+    tracker: FrameStage,
     predictor: AskedPredictor,
     *,
     window: int = 8,
@@ -95,10 +166,14 @@ def run_pipeline(
         if frame.late:
             amend(tracker, frame, refusals)
             continue
-        with clock.measure("track"):
-            measurements, tracks = tracker.step(frame, published=published(frame))
+        try:
+            with clock.measure("track"):
+                measurements, tracks = tracker.step(frame, published=published(frame))
+        except FrameRefused as error:
+            refusals.add("tracks", frame.sensors.stamp_ns, str(error))
+            continue
         for _ in range(measurements.refused):
-            refusals.add("lidar clusters", frame.sensors.stamp_ns, "cluster out of reach, or of an impossible shape")
+            refusals.add("scans", frame.sensors.stamp_ns, "cluster out of reach, or of an impossible shape")
         if not published(frame):
             continue
         predictor.ask(tracks, vehicle_pose(frame.sensors, tracks))
@@ -109,12 +184,12 @@ def run_pipeline(
         yield _answered(*asked.popleft(), predictor.answer(), clock)
 
 
-def amend(tracker: FrameTracker, frame: SyncedFrame, refusals: Refusals) -> None:
+def amend(tracker: FrameStage, frame: SyncedFrame, refusals: Refusals) -> None:
     """Takes a late frame in; one that is too late even for that is refused."""
     try:
         tracker.amend(frame)
     except LateScanError:
-        refusals.add("lidar clusters", frame.sensors.stamp_ns, "scan too late to use")
+        refusals.add("scans", frame.sensors.stamp_ns, "scan too late to use")
 
 
 def _answered(

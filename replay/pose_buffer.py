@@ -39,7 +39,13 @@ class PoseBuffer:
         return self._stamps_ns[-1] if self._stamps_ns else 0
 
     def add(self, pose: VehiclePose) -> None:
-        """Takes a pose; one out of order is put in its place, one of a known stamp replaces."""
+        """Takes a pose; one out of order is put in its place, one of a known stamp replaces.
+
+        One in another frame ends what was before: between two frames there is nothing to interpolate.
+        """
+        if self._poses and pose.frame_id != self._poses[-1].frame_id:
+            for column in (self._stamps_ns, self._poses, self._rows):
+                column.clear()
         index = bisect_left(self._stamps_ns, pose.stamp_ns)
         row = [*pose.position_m.tolist(), *pose.quaternion_xyzw.tolist()]
         if index < len(self._stamps_ns) and self._stamps_ns[index] == pose.stamp_ns:

@@ -2,22 +2,25 @@
 
 import concurrent.futures
 import json
+import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from typing import Self
 
 from replay.errors import OutputError, PredictorError
 from replay.frame_result import FrameResult
 from replay.interrupts import Interrupted, Interrupts
 from replay.log_reader import checksum
-from replay.log_writer import LogWriter
+from replay.log_writer import DEFAULT_FORMATS, LogWriter, outputs
 from replay.rerun_view import NullView, View
 from replay.score import ReplayScore
 from replay.session import Replay
-from schemas.topics import OUTPUTS
+
+CHECKSUM_PATIENCE_S = 3.0  # for the recordings' checksums, where a replay ends early
 
 
 @dataclass
@@ -37,6 +40,7 @@ class Summary:
     refusals: list[dict[str, object]] = field(default_factory=list)
     first_refusals: list[str] = field(default_factory=list)
     salvage_losses: list[str] = field(default_factory=list)
+    unmatched_labels: list[str] = field(default_factory=list)  # all that were seen, if none means a pedestrian
     latency_ms: dict[str, dict[str, float]] = field(default_factory=dict)
     score: dict[str, object] = field(default_factory=dict)
     complete: bool = False
@@ -58,6 +62,7 @@ class Summary:
             "refused": self.refused,
             "refusals": self.refusals,
             "salvage_losses": self.salvage_losses,
+            "unmatched_labels": self.unmatched_labels,
             "predictor_restarts": self.restarts,
             "model": self.model,
             "log_s": round(self.log_s, 3),
@@ -75,9 +80,12 @@ def record(
     view: View | None = None,
     *,
     merge: bool = False,
+    emit: Sequence[str] = DEFAULT_FORMATS,
     on_frame: Callable[[FrameResult], None] = lambda _: None,
 ) -> Summary:
     """Replays a log into an MCAP file and a view, and scores it; with `merge` the file holds the recording, too.
+
+    `emit` names the forms in which tracks and predictions are written (`log_writer.FORMATS`).
 
     Ctrl-C, SIGTERM and a predictor that fails for good end it early: the outputs are then complete up to the last
     frame, and the summary's `stopped` holds the reason. Raises LogError or OutputError for anything else; the output
@@ -85,7 +93,7 @@ def record(
     """
     if output is not None:
         refuse_overwriting(run.reader.paths, output)
-    held = {channel.topic for channel in run.reader.channels} & {topic.name for topic in OUTPUTS}
+    held = {channel.topic for channel in run.reader.channels} & {each.topic.name for each in outputs(emit)}
     if merge and held:
         raise OutputError(f"the recording already holds {', '.join(sorted(held))}; replay it without --merge")
     summary = Summary(salvage_losses=run.reader.losses.notes)
@@ -93,13 +101,14 @@ def record(
     last_ns = run.start_ns
     started = time.perf_counter()
     with ExitStack() as stack:
-        hashing = stack.enter_context(concurrent.futures.ThreadPoolExecutor(1))
-        checksums = hashing.submit(lambda: [checksum(path) for path in run.reader.paths])
+        checksums = stack.enter_context(_Checksums(run.reader.paths))
         interrupts = stack.enter_context(Interrupts())
         stack.enter_context(run)
         ready = time.perf_counter()
         writer = (
-            stack.enter_context(LogWriter(output, run.reader.paths if merge else ())) if output is not None else None
+            stack.enter_context(LogWriter(output, run.reader.paths if merge else (), emit))
+            if output is not None
+            else None
         )
         shown = stack.enter_context(view or NullView())
         try:
@@ -120,12 +129,15 @@ def record(
             summary.stopped = error
         interrupts.ignore()  # the outputs are being closed; that takes no time worth interrupting
         if writer is not None:
-            writer.describe(_lineage(run, checksums.result(), complete=summary.complete), _settings(run))
+            digests = checksums.result(None if summary.complete else CHECKSUM_PATIENCE_S)
+            lineage = _lineage(run, digests, complete=summary.complete)
+            writer.describe(lineage, _settings(run), complete=summary.complete)
     summary.wall_s = time.perf_counter() - ready
     summary.startup_s = ready - started
     summary.log_s = (last_ns - run.start_ns) / 1e9
     summary.refused, summary.refusals = run.refusals.total, run.refusals.as_json()
     summary.first_refusals = run.refusals.first
+    summary.unmatched_labels = run.labels.unmatched
     summary.restarts = run.predictor.restarts
     summary.model = {"name": run.predictor.model.name, "sha256": run.predictor.model.checksum}
     summary.latency_ms = run.clock.as_json()
@@ -145,6 +157,32 @@ def refuse_overwriting(recordings: Sequence[Path], *outputs: Path) -> None:
             raise OutputError(f"{output} would be written twice, the second time over the first; choose another name")
 
 
+class _Checksums:
+    """The recordings' SHA-256, computed while they are replayed; left off with the block."""
+
+    def __init__(self, paths: Sequence[Path]):
+        self._paths = paths
+        self._abandoned = threading.Event()
+
+    def __enter__(self) -> Self:
+        self._pool = concurrent.futures.ThreadPoolExecutor(1)
+        self._digests = self._pool.submit(lambda: [checksum(path, self._abandoned) for path in self._paths])
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._abandoned.set()
+        self._pool.shutdown()
+
+    def result(self, patience_s: float | None) -> list[str | None]:
+        """Waits, for ever or so long; of what is not known by then None.
+
+        Of a huge recording it takes minutes, which nobody has who pressed Ctrl-C.
+        """
+        concurrent.futures.wait([self._digests], timeout=patience_s)
+        self._abandoned.set()
+        return self._digests.result()
+
+
 def _count(summary: Summary, result: FrameResult) -> None:
     summary.frames += 1
     summary.track_ids.update((result.tracks.epoch, track.id) for track in result.tracks.tracks)
@@ -152,7 +190,7 @@ def _count(summary: Summary, result: FrameResult) -> None:
     summary.fallbacks += sum(prediction.fallback for prediction in result.predictions.predictions)
 
 
-def _lineage(run: Replay, checksums: list[str], *, complete: bool) -> dict[str, str]:
+def _lineage(run: Replay, checksums: list[str | None], *, complete: bool) -> dict[str, str]:
     """What the output came from; base names only, so that the folder a log lies in changes nothing."""
     inputs = [{"name": path.name, "sha256": digest} for path, digest in zip(run.reader.paths, checksums, strict=True)]
     return {

@@ -13,10 +13,9 @@ import numpy as np
 from replay.camera_check import CameraCheck, Estimate, median_and_mad
 from replay.log_info import timings
 from replay.log_reader import LogReader
-from replay.roles import STAMPED, Roles
+from replay.roles import SCANS, STAMPED, Roles
 from replay.stamp_guard import StampGuard, Verdict
 from replay.time_sync import SyncSettings
-from schemas import topics
 from schemas.messages import FloatArray, IntArray
 
 # when a significant figure becomes a verdict
@@ -93,43 +92,40 @@ def check_stamps(
     """
     span_s = min(seconds, (reader.end_ns - reader.start_ns) / 1e9 + 1)
     end_ns = min(reader.end_ns, reader.start_ns + round(span_s * 1e9))
-    wanted = [t for t in topics.INPUTS if t.role in (*STAMPED, "ground truth") and t.name in roles.topic_of]
     found = timings(reader, span_s)
-    used, resets, usual = _as_replayed({t.name: found[roles.topic_of[t.name]] for t in wanted}, roles, offsets_ns)
+    used, resets, usual = _as_replayed({name: found[name] for name in roles.topics(*STAMPED, "truth")}, offsets_ns)
     return StampCheck(
         tuple(
             _timing(
-                topic.role,
-                roles.topic_of[topic.name],
-                used[topic.name],
-                used["/velodyne/front/clusters"],
+                roles.readings[name].role,
+                name,
+                used[name],
+                used[roles.scans],
                 sync,
                 (reader.start_ns, end_ns),
                 usual,
             )
-            for topic in wanted
-            if topic.role in STAMPED
+            for name in roles.topics(*STAMPED)
         ),
         tuple(ClockReset((at_ns - reader.start_ns) / 1e9, by_ns / 1e9) for at_ns, by_ns in resets),
     )
 
 
 def _as_replayed(
-    found: Mapping[str, tuple[IntArray, IntArray]], roles: Roles, offsets_ns: Mapping[str, int]
+    found: Mapping[str, tuple[IntArray, IntArray]], offsets_ns: Mapping[str, int]
 ) -> tuple[dict[str, _Stamps], list[tuple[int, float]], int]:
     """Runs stamps through the guards in log order, as TimeSync does.
 
     Args:
-        found: default topic name -> stamps and delays (N,), in the log's order.
-        roles: the topics in use.
-        offsets_ns: name in the log -> what is added to stamps.
+        found: topic -> stamps and delays (N,), in the log's order.
+        offsets_ns: topic -> what is added to stamps.
 
     Returns:
         what is left of each topic, (log time, by how much in ns) of each clock reset, and the epoch whose stamps agree
         best with the log's clock.
     """
     names = list(found)
-    offset = {name: offsets_ns.get(roles.topic_of[name], 0) for name in names}
+    offset = {name: offsets_ns.get(name, 0) for name in names}
     stamps = np.concatenate([found[name][0] + offset[name] for name in names])
     delays = np.concatenate([found[name][1] - offset[name] for name in names])
     topic = np.repeat(np.arange(len(names)), [len(found[name][0]) for name in names])
@@ -188,9 +184,9 @@ def _timing(
         rate, jitter, many_ns = 1e9 / period_ns, 1.4826 * mad_ns / 1e6, 3 * period_ns
     from_ns, waits_ns = _waits(mine, *span_ns)
     longest = int(waits_ns.argmax()) if len(waits_ns) else None
-    skews_ms = _skews_ms(scans, mine) if role in ("camera detections", "vehicle pose") else np.zeros(0)
+    skews_ms = _skews_ms(scans, mine) if role in ("camera", "pose") else np.zeros(0)
     near = None
-    if role == "camera detections" and len(skews_ms):
+    if role == "camera" and len(skews_ms):
         near = float((skews_ms <= sync.camera_tolerance_ms).mean())
     return TopicTiming(
         topic,
@@ -264,7 +260,7 @@ def _reset_verdict(reset: ClockReset) -> str:
 def _timing_verdicts(timing: Sequence[TopicTiming]) -> list[str]:
     lines = []
     for topic in timing:
-        if topic.longest_gap_s > GAP_S and topic.role != "camera image":
+        if topic.longest_gap_s > GAP_S and topic.role != "image":
             lines.append(
                 f"{topic.topic}: no message for {topic.longest_gap_s:.1f} s, from {topic.longest_gap_at_s:.1f} s on"
             )
@@ -282,7 +278,7 @@ def _offset_verdicts(timing: Sequence[TopicTiming], cameras: Sequence[CameraChec
     found_of = {c.topic: c.time_offset_ms for c in cameras if c.time_offset_ms and c.time_offset_observable}
     common = _common(list(found_of.values()))
     if common is not None and common.exceeds(1e3 * OFFSET_S):
-        scans = of_role["lidar clusters"][0].topic
+        scans = next(t for role in SCANS for t in of_role[role]).topic
         lines.append(
             f"{scans}: its stamps are about {abs(common.value):.0f} ms (± {2 * common.error:.0f}) "
             f"{_late(-common.value)}, by how the boxes of every camera move against the clusters: "

@@ -21,7 +21,7 @@ from typing import IO, Protocol, Self
 
 import zenoh
 
-from pcgan.bus import ENCODING, BusError, ModelIdentity, any_alive_key, model_of, open_session
+from pcgan.bus import ENCODING, BusError, ModelIdentity, any_alive_key, model_of, open_session, settle
 from replay.errors import PredictorError
 from schemas import codec, topics
 from schemas.messages import PredictionFrame, TrackFrame, VehiclePose
@@ -156,7 +156,7 @@ class RemotePredictor:
         self.restarts = 0
         self._inbox: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
         self._news: queue.SimpleQueue[tuple[zenoh.SampleKind, str]] = queue.SimpleQueue()
-        self._subscriber = session.declare_subscriber(topics.zenoh_key(topics.PREDICTIONS, namespace), self._inbox.put)
+        self._subscriber = session.declare_subscriber(topics.zenoh_key(topics.PREDICTIONS, namespace), self._hear)
         self._watch = session.liveliness().declare_subscriber(
             any_alive_key(namespace), lambda sample: self._news.put((sample.kind, str(sample.key_expr))), history=True
         )
@@ -246,6 +246,8 @@ class RemotePredictor:
         """Ends the session and, if it was spawned, the predictor."""
         if self._child is not None:
             self._child.stop()
+        elif self._unanswered:  # a run that was broken off: a plain close would damage a frame on its way to others'
+            settle(self._session, timeout_s=2.0)
         self._session.close()  # type: ignore[no-untyped-call]
         if self._log is not None:
             self._log.close()
@@ -258,10 +260,13 @@ class RemotePredictor:
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
         self.close()
 
+    def _hear(self, sample: zenoh.Sample) -> None:
+        """Queues an answer of this run; others' are ignored, and do not pile up while nobody asks."""
+        if sample.attachment is not None and sample.attachment.to_bytes() == self._run:
+            self._inbox.put(sample)
+
     def _take(self, sample: zenoh.Sample) -> None:
-        """Files an answer of this run; others', and second answers to one sequence, are ignored."""
-        if sample.attachment is None or sample.attachment.to_bytes() != self._run:
-            return
+        """Files an answer; second answers to one sequence are ignored."""
         try:
             frame = codec.decode(PredictionFrame, sample.payload.to_bytes())
         except codec.CodecError as error:

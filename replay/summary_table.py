@@ -6,9 +6,11 @@ from typing import Any
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
-from replay.errors import ReplayError
+from replay.class_labels import unmatched_line
+from replay.errors import ReplayError, refused_line
 from replay.record import Summary
 
 
@@ -44,7 +46,9 @@ def print_summary(summary: Summary, written: Sequence[Path], console: Console) -
     for line in summary.first_refusals[:5]:
         console.print(line, markup=False)
     if summary.refused:
-        console.print(f"[yellow]{summary.refused} messages were refused[/]; --json lists them by topic and reason")
+        console.print(refused_line(summary.refused))
+    if summary.unmatched_labels:
+        console.print(f"[yellow]{escape(unmatched_line(summary.unmatched_labels))}[/]", soft_wrap=True)
     for line in summary.salvage_losses[:5]:
         console.print(line, markup=False)
     if summary.salvage_losses:

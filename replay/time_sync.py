@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from replay.errors import LogError, Refusals
 from replay.pose_buffer import PoseBuffer
+from replay.roles import Roles, time_offsets
 from replay.stamp_guard import StampGuard, Verdict
 from replay.transform_tree import TransformTree
 from schemas.messages import (
@@ -25,17 +26,21 @@ from schemas.messages import (
     CompressedImage,
     GroundTruthFrame,
     LidarClusters,
+    ObjectTracks,
+    PointCloud,
+    TrackFrame,
     Transform,
     VehiclePose,
 )
 from tracking.camera import CalibrationError, CameraModel
+from tracking.geometry import quaternion_of
+from tracking.segmentation import SegmentationParams, segment
 from tracking.sensor_frame import CameraFrame, SensorFrame
-
-DEFAULT_VEHICLE_FRAME = "base_link"  # of poses that do not name the frame they are of
 
 MAX_OFFSET_MS = 10_000.0
 
 Stamped = TypeVar("Stamped", CameraDetections, CompressedImage)
+Scan = LidarClusters | ObjectTracks | TrackFrame  # whatever gives a frame
 OffsetMs = Annotated[float, Field(ge=-MAX_OFFSET_MS, le=MAX_OFFSET_MS, allow_inf_nan=False)]
 
 
@@ -50,8 +55,11 @@ class SyncSettings(BaseModel):
     wait_ms: float = Field(
         default=300, ge=0, description="log time after which a scan is released whatever is still missing"
     )
-    time_offset_ms: dict[str, OffsetMs] = Field(
-        default={}, description="topic, by its name in the log or its default name -> added to its messages' stamps"
+    time_offset_ms: dict[str, OffsetMs] = Field(default={}, description="topic -> added to its messages' stamps")
+    vehicle_frame: str = Field(default="base_link", description="of poses that do not name the frame they are of")
+    odometry_frame: str | None = Field(
+        default=None,
+        description="where poses made of transforms are. None: odom if it is there, else the vehicle's root frame",
     )
 
 
@@ -66,6 +74,7 @@ class SyncedFrame:
     images: Mapping[str, CompressedImage]
     ground_truth: GroundTruthFrame | None
     late: bool = False  # its successors were released before it: it amends the tracks and gives no frame of its own
+    objects: ObjectTracks | TrackFrame | None = None  # another tracker's tracks, in the place of clusters
 
 
 @dataclass
@@ -78,10 +87,11 @@ class _Camera:
 
 
 class TimeSync:
-    """Collects messages by their default topic names and releases frames.
+    """Collects messages and releases frames: one per scan, be it clusters, points or another tracker's tracks.
 
-    `push` and `flush` return the frames that became complete; refused messages go to `refusals`. `offsets_ns` (topic as
-    it is pushed -> ns) is added to the stamps of what is pushed: the frames carry the corrected stamps.
+    `push` and `flush` return the frames that became complete; refused messages go to `refusals`. `offsets_ns` (topic ->
+    ns) is added to the stamps of what is pushed: the frames carry the corrected stamps. Transforms pushed on a
+    `moving` topic say where the vehicle is.
     """
 
     def __init__(
@@ -90,8 +100,12 @@ class TimeSync:
         settings: SyncSettings,
         refusals: Refusals,
         offsets_ns: Mapping[str, int] = MappingProxyType({}),
+        moving: str | None = None,
+        segmentation: SegmentationParams | None = None,
     ):
         self._settings = settings
+        self._moving = moving
+        self._segmentation = segmentation or SegmentationParams()
         self._tolerance_ns = int(settings.camera_tolerance_ms * 1e6)
         self._wait_ns = int(settings.wait_ms * 1e6)
         self._refusals = refusals
@@ -100,10 +114,19 @@ class TimeSync:
         self._models: dict[str, tuple[CameraModel, str]] = {}  # camera -> model, optical frame
         self._calibrations: dict[str, CameraCalibration] = {}
         self._camera_names = cameras
+        self._awaited = cameras
         self._epoch = 0
         self._released_any = False
         self._last_log_time_ns = 0
         self._start_epoch(None)
+
+    @classmethod
+    def of(
+        cls, roles: Roles, settings: SyncSettings, segmentation: SegmentationParams, refusals: Refusals
+    ) -> "TimeSync":
+        """Returns one for the topics in use."""
+        offsets_ns = time_offsets(roles, settings.time_offset_ms)
+        return cls(roles.cameras, settings, refusals, offsets_ns, roles.pose, segmentation)
 
     def _start_epoch(self, reference: tuple[int, int] | None) -> None:
         """Forgets everything that has a stamp; calibration and mounts stay."""
@@ -111,7 +134,7 @@ class TimeSync:
         self._guards: dict[str, StampGuard] = {}
         self._cameras = {name: _Camera() for name in self._camera_names}
         self._poses = PoseBuffer()
-        self._scans: list[tuple[int, int, LidarClusters]] = []  # heap: stamp (each once), log time, scan
+        self._scans: list[tuple[int, int, Scan]] = []  # heap: stamp (each once), log time, scan
         self._seen_scans: deque[int] = deque(maxlen=64)
         self._ground_truth: deque[GroundTruthFrame] = deque(maxlen=64)
         self._last_released_ns = 0
@@ -135,13 +158,16 @@ class TimeSync:
         self._last_log_time_ns = max(self._last_log_time_ns, log_time_ns)
         if isinstance(message, Transform | CameraCalibration):
             self.take_static(topic, camera, message, self._refusals)
-        else:
+            message = self._moved(message) if isinstance(message, Transform) and topic == self._moving else None
+        if message is not None:
             message = self._corrected(topic, message)
             stamp_ns: int = message.stamp_ns  # type: ignore[attr-defined]
             verdict = self._guard(topic).check(stamp_ns, log_time_ns)
             if verdict is Verdict.REFUSE:
                 self._refusals.add(topic, stamp_ns, "absurd stamp", f"log time {log_time_ns / 1e9:.3f} s")
                 return
+            if isinstance(message, PointCloud):
+                message = segment(message, self._segmentation)
             if verdict is Verdict.NEW_EPOCH:
                 yield from self.flush()
                 self._epoch += 1
@@ -151,9 +177,38 @@ class TimeSync:
         if self._scans:
             yield from self._release(lambda scan_ns, arrived_ns: self._complete(scan_ns) or self._waited(arrived_ns))
 
+    def advance(self, log_time_ns: int) -> Iterator[SyncedFrame]:
+        """Yields the frames that have waited long enough by a log time at which no message came."""
+        self._last_log_time_ns = max(self._last_log_time_ns, log_time_ns)
+        yield from self._release(lambda _, arrived_ns: self._waited(arrived_ns))
+
+    def wait_for(self, cameras: tuple[str, ...]) -> None:
+        """Lets scans wait for these cameras alone from now on; boxes of the others are used if they are there."""
+        self._awaited = cameras
+
     def flush(self) -> Iterator[SyncedFrame]:
         """Yields what is still waiting, at the end of the log or of an epoch."""
         yield from self._release(lambda *_: True)
+
+    def _moved(self, transform: Transform) -> VehiclePose | None:
+        """Returns the vehicle's pose by the transforms known, if this one is the link of its chain that moves.
+
+        Of several that move, it is the one nearest to the vehicle. Mounts in between say nothing new, and some stacks
+        stamp them half a second ahead. The velocity is unknown.
+        """
+        vehicle = self._settings.vehicle_frame
+        chain = self._tree.ancestors(vehicle)
+        top = self._settings.odometry_frame or ("odom" if "odom" in chain else chain[-1])
+        if top not in chain or transform.stamp_ns == 0:  # only static ones may have no stamp
+            return None
+        links = chain[: chain.index(top)]
+        moving = [link for link in links if self._tree.moves(link)]
+        if transform.child_frame_id not in (moving[:1] or links):
+            return None
+        pose = self._tree.transform(top, vehicle)
+        assert pose is not None, "what is in one chain is joined"
+        unknown = np.full(3, np.nan)
+        return VehiclePose(transform.stamp_ns, top, vehicle, pose[:3, 3], quaternion_of(pose), unknown, unknown)
 
     def _corrected(self, topic: str, message: object) -> object:
         """Returns the message with its topic's time offset added to its stamp."""
@@ -176,7 +231,7 @@ class TimeSync:
             self._poses.add(message)
         elif isinstance(message, GroundTruthFrame):
             self._ground_truth.append(message)
-        elif isinstance(message, LidarClusters):
+        elif isinstance(message, LidarClusters | ObjectTracks | TrackFrame):
             if message.stamp_ns in self._seen_scans:
                 self._refusals.add(topic, message.stamp_ns, "repeated scan")
                 return
@@ -191,7 +246,7 @@ class TimeSync:
     def _complete(self, scan_ns: int) -> bool:
         cameras_due_ns = scan_ns + self._tolerance_ns
         return self._poses.latest_ns >= cameras_due_ns and all(
-            camera.latest_ns >= cameras_due_ns for camera in self._cameras.values()
+            self._cameras[name].latest_ns >= cameras_due_ns for name in self._awaited
         )
 
     def _waited(self, arrived_ns: int) -> bool:
@@ -206,22 +261,22 @@ class TimeSync:
                 self._released_any = True
                 yield frame
 
-    def _synced(self, scan: LidarClusters) -> SyncedFrame | None:
+    def _synced(self, scan: Scan) -> SyncedFrame | None:
         """Joins a scan with poses, cameras, images and truth; refuses it if the vehicle's pose or mount is unknown."""
         chosen = {name: self._nearest(camera.detections, scan.stamp_ns) for name, camera in self._cameras.items()}
         detections = {name: found for name, found in chosen.items() if found is not None and name in self._models}
         stamps_ns = [scan.stamp_ns, *(found.stamp_ns for found in detections.values())]
         poses = self._poses.at(stamps_ns)
         if not poses.known[0]:
-            self._refusals.add("lidar clusters", scan.stamp_ns, "no vehicle pose within 50 ms")
+            self._refusals.add("scans", scan.stamp_ns, "no vehicle pose within 50 ms")
             return None
         pose = self._poses.nearest(scan.stamp_ns)
-        vehicle_frame = pose.child_frame_id or DEFAULT_VEHICLE_FRAME
-        vehicle_from_lidar = self._mount(vehicle_frame, scan.frame_id, scan.stamp_ns)
-        if vehicle_from_lidar is None:
+        vehicle_frame = pose.child_frame_id or self._settings.vehicle_frame
+        map_from_vehicle = poses.map_from_vehicle[0]
+        map_from_scan = self._map_from_scan(scan, pose.frame_id, vehicle_frame, map_from_vehicle)
+        if map_from_scan is None:
             return None
 
-        map_from_vehicle = poses.map_from_vehicle[0]
         cameras = []
         vehicle_from_map = np.linalg.inv(poses.map_from_vehicle)  # (S, 4, 4)
         for (name, found), vehicle_from_map_then, known in zip(
@@ -233,8 +288,8 @@ class TimeSync:
                 cameras.append(CameraFrame(name, found, model, camera_from_vehicle @ vehicle_from_map_then))
         sensors = SensorFrame(
             scan.stamp_ns,
-            scan,
-            map_from_vehicle @ vehicle_from_lidar,
+            scan if isinstance(scan, LidarClusters) else _no_clusters(scan),
+            map_from_scan,
             map_from_vehicle,
             tuple(cameras),
             pose.frame_id,
@@ -250,7 +305,21 @@ class TimeSync:
             _vehicle_state(map_from_vehicle, self._poses.velocity(scan.stamp_ns)),
             {name: image for name, image in images.items() if image is not None},
             truth,
+            objects=None if isinstance(scan, LidarClusters) else scan,
         )
+
+    def _map_from_scan(
+        self, scan: Scan, map_frame: str, vehicle_frame: str, map_from_vehicle: NDArray[np.float64]
+    ) -> NDArray[np.float64] | None:
+        """Returns (4, 4) from the scan's frame; None, the reason counted, if no transform joins it to the vehicle."""
+        frame = scan.frame_id
+        if not isinstance(scan, LidarClusters):  # others' tracks need not hang from the vehicle
+            if frame == map_frame:
+                return np.eye(4)
+            if not self._tree.is_fixed(frame, vehicle_frame):
+                return self._mount(map_frame, frame, scan.stamp_ns)
+        mount = self._mount(vehicle_frame, frame, scan.stamp_ns)
+        return None if mount is None else map_from_vehicle @ mount
 
     def _nearest(self, messages: deque[Stamped], stamp_ns: int) -> Stamped | None:
         """Returns the message nearest in time, within the tolerance; of equally near ones the older."""
@@ -265,6 +334,11 @@ class TimeSync:
                 raise LogError(f"{problem}; the frames of /tf_static are {', '.join(self._tree.frames) or 'none'}")
             self._refusals.add("transforms", stamp_ns, problem)
         return transform
+
+
+def _no_clusters(scan: ObjectTracks | TrackFrame) -> LidarClusters:
+    none = np.zeros((0, 3))
+    return LidarClusters(scan.stamp_ns, scan.frame_id, none, none, np.zeros(0, np.int64))
 
 
 def _same_camera(a: CameraCalibration, b: CameraCalibration) -> bool:

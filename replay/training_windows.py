@@ -23,7 +23,6 @@ from pcgan.dataset import (
 from pcgan.history import observations, vehicle_states
 from pcgan.recipes import Task
 from pcgan.windows_file import WindowsError, save_windows
-from replay.pipeline import FrameTracker
 from replay.score import Positions, lookup, match, true_positions
 from replay.session import Replay
 from replay.simulator import simulate
@@ -169,7 +168,7 @@ class _Scene:
 
 def _drive_scenes(log: Path, tasks: Mapping[str, Task]) -> dict[str, list[_Scene]]:
     run = Replay([log])
-    tracker = FrameTracker(run.settings.tracking)
+    tracker = run.tracker()
     truth: list[Positions] = []
     scenes: dict[str, list[_Scene]] = {name: [] for name in tasks}
     for count, frame in enumerate(run.frames()):

@@ -12,6 +12,7 @@ class TransformTree:
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, NDArray[np.float64]]] = {}  # child -> parent, parent_from_child
+        self._moving: set[str] = set()  # children whose transform has changed
         self._resolved: dict[tuple[str, str], NDArray[np.float64] | None] = {}
 
     @property
@@ -19,13 +20,36 @@ class TransformTree:
         """All frame names, sorted."""
         return sorted({*self._parents, *(parent for parent, _ in self._parents.values())})
 
+    def ancestors(self, frame: str) -> list[str]:
+        """Returns the frame itself and what it is fixed to, step by step, up to the root."""
+        return list(self._ancestors(frame))
+
     def add(self, transform: Transform) -> None:
         """Takes one transform; a newer one of the same child replaces the older."""
         parent_from_child = np.eye(4)
         parent_from_child[:3, :3] = Rotation.from_quat(transform.quaternion_xyzw).as_matrix()
         parent_from_child[:3, 3] = transform.translation_m
-        self._parents[transform.child_frame_id] = (transform.parent_frame_id, parent_from_child)
+        child, known = transform.child_frame_id, self._parents.get(transform.child_frame_id)
+        if known is not None:
+            if known[0] == transform.parent_frame_id and np.array_equal(known[1], parent_from_child):
+                return  # a mount, logged again and again
+            self._moving.add(child)
+        self._parents[child] = (transform.parent_frame_id, parent_from_child)
         self._resolved.clear()
+
+    def moves(self, frame: str) -> bool:
+        """Tells whether a frame has ever changed its place in its parent."""
+        return frame in self._moving
+
+    def is_fixed(self, frame: str, vehicle: str) -> bool:
+        """Tells whether a frame goes where the vehicle's goes: it hangs from it, or nothing between them ever moved."""
+        above, beside = self.ancestors(vehicle), self.ancestors(frame)
+        if vehicle in beside:
+            return True
+        joined = next((ancestor for ancestor in beside if ancestor in above), None)
+        if joined is None:
+            return False
+        return not any(self.moves(link) for path in (above, beside) for link in path[: path.index(joined)])
 
     def transform(self, target: str, source: str) -> NDArray[np.float64] | None:
         """Returns target_from_source (4, 4), through the nearest common ancestor; None if the frames are not joined."""

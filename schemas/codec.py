@@ -6,6 +6,7 @@ probabilities make sense. Whatever is wrong raises `CodecError` with the field's
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from functools import cache, lru_cache
 from itertools import accumulate, islice
 from typing import Any, TypeVar
@@ -23,12 +24,14 @@ from schemas.messages import (
     LidarClusters,
     Mixture,
     ModalPath,
+    NodeHealth,
     Prediction,
     PredictionFrame,
     Track,
     TrackFrame,
     TrackHistory,
     VehicleHistory,
+    VehiclePath,
     VehiclePose,
 )
 
@@ -350,7 +353,26 @@ def _encode_track_frame(frame: TrackFrame) -> Message:
         history = track.history
         hx, hy, hvx, hvy = history.states.T
         _set_arrays(encoded.history, stamp_ns=history.stamps_ns, x=hx, y=hy, vx=hvx, vy=hvy, coasting=history.coasting)
+    if frame.vehicle_path is not None:
+        message.vehicle_path.CopyFrom(_encode_path(frame.vehicle_path))
     return message
+
+
+def _encode_path(path: VehiclePath) -> pb.VehiclePath:
+    message = pb.VehiclePath(front=path.front_m, rear=path.rear_m, width=path.width_m)
+    x, y, yaw = path.poses.T
+    _set_arrays(message, t_s=path.times_s, x=x, y=y, yaw=yaw)
+    return message
+
+
+def _decode_path(message: pb.VehiclePath) -> VehiclePath:
+    columns = _columns(message, "t_s", "x", "y", "yaw")
+    times_s, poses = columns[:, 0], columns[:, 1:]
+    _require(len(times_s) > 0, message, "has no poses")
+    _require(times_s[0] >= 0 and bool((np.diff(times_s) > 0).all()), message, "has times that do not rise from 0")
+    _check_scalars(message, "front", "rear", "width")
+    _require(min(message.front, message.rear) >= 0 and message.width > 0, message, "is of a vehicle without size")
+    return VehiclePath(times_s, poses, message.front, message.rear, message.width)
 
 
 def _decode_track_frame(message: pb.TrackFrame) -> TrackFrame:
@@ -362,6 +384,7 @@ def _decode_track_frame(message: pb.TrackFrame) -> TrackFrame:
     tracks = message.tracks
     ids = {track.id for track in tracks}
     _require(len(ids) == len(tracks), message, "has two tracks of one id")
+    _require(max(ids, default=0) < 2**63, message, f"has a track of the id {max(ids, default=0)}, more than 2^63")
     return TrackFrame(
         message.sequence,
         message.stamp_ns,
@@ -370,6 +393,7 @@ def _decode_track_frame(message: pb.TrackFrame) -> TrackFrame:
         _decode_tracks(tracks) if tracks else (),
         message.pose_extrapolated,
         message.epoch,
+        _decode_path(message.vehicle_path) if message.HasField("vehicle_path") else None,
     )
 
 
@@ -425,7 +449,12 @@ def _encode_prediction_frame(frame: PredictionFrame) -> Message:
         sequence=frame.sequence, stamp_ns=frame.stamp_ns, frame_id=frame.frame_id, model=frame.model, dt_s=frame.dt_s
     )
     for prediction in frame.predictions:
-        encoded = message.predictions.add(track_id=prediction.track_id, fallback=prediction.fallback)
+        encoded = message.predictions.add(
+            track_id=prediction.track_id,
+            fallback=prediction.fallback,
+            corridor_probability=prediction.corridor_probability,
+            corridor_time_s=prediction.corridor_time_s,
+        )
         for path in prediction.paths:
             x, y = path.points_m.T
             _set_arrays(encoded.paths.add(probability=path.probability), x=x, y=y)
@@ -440,6 +469,8 @@ def _encode_prediction_frame(frame: PredictionFrame) -> Message:
             sigma_y=mixture.sigmas_m[..., 1],
             rho=mixture.rhos,
         )
+    if frame.vehicle_path is not None:
+        message.vehicle_path.CopyFrom(_encode_path(frame.vehicle_path))
     return message
 
 
@@ -448,9 +479,11 @@ def _decode_prediction_frame(message: pb.PredictionFrame) -> PredictionFrame:
     _require(message.dt_s > 0 and math.isfinite(message.dt_s), message, f"dt_s {message.dt_s} is not positive")
     ids = {prediction.track_id for prediction in message.predictions}
     _require(len(ids) == len(message.predictions), message, "has two predictions of one track")
+    _require(max(ids, default=0) < 2**63, message, f"predicts a track of the id {max(ids, default=0)}, more than 2^63")
     predictions = _decode_predictions(message.predictions) if message.predictions else ()
+    path = _decode_path(message.vehicle_path) if message.HasField("vehicle_path") else None
     return PredictionFrame(
-        message.sequence, message.stamp_ns, message.frame_id, message.model, message.dt_s, predictions
+        message.sequence, message.stamp_ns, message.frame_id, message.model, message.dt_s, predictions, path
     )
 
 
@@ -476,7 +509,11 @@ def _decode_predictions(predictions: Sequence[pb.Prediction]) -> tuple[Predictio
         _require(
             all(len(path.points_m) == steps for path in tree), prediction, f"has a path that is not {steps} steps long"
         )
-        decoded.append(Prediction(prediction.track_id, prediction.fallback, tree, mixture))
+        risk = prediction.corridor_probability
+        _require(0 <= risk <= 1, prediction, f"corridor_probability {risk} is outside 0 to 1")
+        time_s = prediction.corridor_time_s if prediction.HasField("corridor_time_s") else None
+        _require(time_s is None or 0 <= time_s < math.inf, prediction, f"corridor_time_s {time_s} makes no sense")
+        decoded.append(Prediction(prediction.track_id, prediction.fallback, tree, mixture, risk, time_s))
     return tuple(decoded)
 
 
@@ -501,6 +538,19 @@ def _decode_mixtures(messages: Sequence[pb.Mixture]) -> list[Mixture]:
     return mixtures
 
 
+# --- nodes ---------------------------------------------------------------------------------------------------------
+
+
+def _encode_health(health: NodeHealth) -> Message:
+    return pb.NodeHealth(**asdict(health))
+
+
+def _decode_health(message: pb.NodeHealth) -> NodeHealth:
+    _check_stamp(message)
+    _check_scalars(message, "uptime_s", "rate_hz", "input_hz", "latency_p50_ms", "latency_p99_ms")
+    return NodeHealth(*(getattr(message, name) for name in NodeHealth.__dataclass_fields__))
+
+
 _ENCODERS: dict[type, Callable[[Any], Message]] = {
     CameraDetections: _encode_detections,
     LidarClusters: _encode_clusters,
@@ -508,6 +558,7 @@ _ENCODERS: dict[type, Callable[[Any], Message]] = {
     TrackFrame: _encode_track_frame,
     PredictionFrame: _encode_prediction_frame,
     GroundTruthFrame: _encode_ground_truth,
+    NodeHealth: _encode_health,
 }
 _DECODERS: dict[type, tuple[Any, Callable[[Any], Any]]] = {
     CameraDetections: (pb.CameraDetections, _decode_detections),
@@ -516,5 +567,6 @@ _DECODERS: dict[type, tuple[Any, Callable[[Any], Any]]] = {
     TrackFrame: (pb.TrackFrame, _decode_track_frame),
     PredictionFrame: (pb.PredictionFrame, _decode_prediction_frame),
     GroundTruthFrame: (pb.GroundTruthFrame, _decode_ground_truth),
+    NodeHealth: (pb.NodeHealth, _decode_health),
 }
 MESSAGE_TYPES: dict[str, type] = {schema_name(message_type): message_type for message_type in _DECODERS}

@@ -37,6 +37,29 @@ class LidarClusters:
 
 
 @dataclass(frozen=True, eq=False)
+class PointCloud:
+    """One LiDAR scan as points, not yet segmented. What is not finite has been left out."""
+
+    stamp_ns: int
+    frame_id: str
+    points_m: FloatArray  # (N, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectTracks:
+    """Objects that another tracker follows, at one stamp; in any frame, people and others."""
+
+    stamp_ns: int
+    frame_id: str
+    ids: tuple[str, ...]  # (A,)  as the other tracker names them
+    labels: tuple[str, ...]  # (A,)  class names, in lower case where the format has numbers only
+    positions_m: FloatArray  # (A, 3)
+    velocities_mps: FloatArray  # (A, 3)  along the axes of `frame_id`; NaN: not given
+    covariances: FloatArray  # (A, 4, 4)  of x, y, vx, vy along those axes; NaN: not given
+    existence: FloatArray  # (A,)  probability, 0 to 1
+
+
+@dataclass(frozen=True, eq=False)
 class VehiclePose:
     """Pose of the vehicle in the odometry frame; twist in the vehicle's own frame."""
 
@@ -97,6 +120,17 @@ class VehicleHistory:
 
 
 @dataclass(frozen=True, eq=False)
+class VehiclePath:
+    """Where the vehicle is going to drive: planned, supposed, or its present motion carried on. Odometry frame."""
+
+    times_s: FloatArray  # (S,)  after the frame's stamp, rising, from 0 on
+    poses: FloatArray  # (S, 3)  x, y, yaw of the vehicle's frame
+    front_m: float  # how far the vehicle reaches ahead of its frame's origin,
+    rear_m: float  # ... behind it,
+    width_m: float  # ... and from side to side
+
+
+@dataclass(frozen=True, eq=False)
 class TrackHistory:
     """A track's recent posterior states in the odometry frame, oldest first; the last is the present one."""
 
@@ -129,6 +163,7 @@ class TrackFrame:
     tracks: tuple[Track, ...] = ()
     pose_extrapolated: bool = False
     epoch: int = 0
+    vehicle_path: VehiclePath | None = None  # where the vehicle is going to drive, if that is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +192,8 @@ class Prediction:
     fallback: bool
     paths: tuple[ModalPath, ...]
     mixture: Mixture
+    corridor_probability: float = 0.0  # of entering the vehicle's corridor within the horizon
+    corridor_time_s: float | None = None  # expected time to that, if it happens; None where it cannot
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +206,26 @@ class PredictionFrame:
     model: str
     dt_s: float
     predictions: tuple[Prediction, ...] = ()
+    vehicle_path: VehiclePath | None = None  # what the corridor is made of; None without a vehicle
+
+
+@dataclass(frozen=True)
+class NodeHealth:
+    """How a live node is doing; rate and latencies over the last second, counts since its start."""
+
+    stamp_ns: int  # the node's clock
+    node: str  # track, predict
+    model: str
+    uptime_s: float
+    rate_hz: float
+    latency_p50_ms: float  # from a frame's arrival to its result; 0 without frames
+    latency_p99_ms: float
+    frames: int
+    dropped: int  # overtaken by newer ones before their turn
+    late: int  # published after their deadline
+    refused: int
+    problem: str = ""
+    input_hz: float = 0.0  # messages that came in
 
 
 @dataclass(frozen=True, eq=False)

@@ -140,8 +140,26 @@ class Track(_message.Message):
     history: TrackHistory
     def __init__(self, id: _Optional[int] = ..., x: _Optional[float] = ..., y: _Optional[float] = ..., vx: _Optional[float] = ..., vy: _Optional[float] = ..., covariance: _Optional[_Iterable[float]] = ..., existence: _Optional[float] = ..., age_ns: _Optional[int] = ..., coasting: _Optional[bool] = ..., history: _Optional[_Union[TrackHistory, _Mapping]] = ...) -> None: ...
 
+class VehiclePath(_message.Message):
+    __slots__ = ("t_s", "x", "y", "yaw", "front", "rear", "width")
+    T_S_FIELD_NUMBER: _ClassVar[int]
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    YAW_FIELD_NUMBER: _ClassVar[int]
+    FRONT_FIELD_NUMBER: _ClassVar[int]
+    REAR_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    t_s: _containers.RepeatedScalarFieldContainer[float]
+    x: _containers.RepeatedScalarFieldContainer[float]
+    y: _containers.RepeatedScalarFieldContainer[float]
+    yaw: _containers.RepeatedScalarFieldContainer[float]
+    front: float
+    rear: float
+    width: float
+    def __init__(self, t_s: _Optional[_Iterable[float]] = ..., x: _Optional[_Iterable[float]] = ..., y: _Optional[_Iterable[float]] = ..., yaw: _Optional[_Iterable[float]] = ..., front: _Optional[float] = ..., rear: _Optional[float] = ..., width: _Optional[float] = ...) -> None: ...
+
 class TrackFrame(_message.Message):
-    __slots__ = ("sequence", "stamp_ns", "frame_id", "vehicle_history", "tracks", "pose_extrapolated", "epoch")
+    __slots__ = ("sequence", "stamp_ns", "frame_id", "vehicle_history", "tracks", "pose_extrapolated", "epoch", "vehicle_path")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     STAMP_NS_FIELD_NUMBER: _ClassVar[int]
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
@@ -149,6 +167,7 @@ class TrackFrame(_message.Message):
     TRACKS_FIELD_NUMBER: _ClassVar[int]
     POSE_EXTRAPOLATED_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
+    VEHICLE_PATH_FIELD_NUMBER: _ClassVar[int]
     sequence: int
     stamp_ns: int
     frame_id: str
@@ -156,7 +175,8 @@ class TrackFrame(_message.Message):
     tracks: _containers.RepeatedCompositeFieldContainer[Track]
     pose_extrapolated: bool
     epoch: int
-    def __init__(self, sequence: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame_id: _Optional[str] = ..., vehicle_history: _Optional[_Union[VehicleHistory, _Mapping]] = ..., tracks: _Optional[_Iterable[_Union[Track, _Mapping]]] = ..., pose_extrapolated: _Optional[bool] = ..., epoch: _Optional[int] = ...) -> None: ...
+    vehicle_path: VehiclePath
+    def __init__(self, sequence: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame_id: _Optional[str] = ..., vehicle_history: _Optional[_Union[VehicleHistory, _Mapping]] = ..., tracks: _Optional[_Iterable[_Union[Track, _Mapping]]] = ..., pose_extrapolated: _Optional[bool] = ..., epoch: _Optional[int] = ..., vehicle_path: _Optional[_Union[VehiclePath, _Mapping]] = ...) -> None: ...
 
 class ModalPath(_message.Message):
     __slots__ = ("probability", "x", "y")
@@ -187,32 +207,68 @@ class Mixture(_message.Message):
     def __init__(self, components: _Optional[int] = ..., weight: _Optional[_Iterable[float]] = ..., x: _Optional[_Iterable[float]] = ..., y: _Optional[_Iterable[float]] = ..., sigma_x: _Optional[_Iterable[float]] = ..., sigma_y: _Optional[_Iterable[float]] = ..., rho: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Prediction(_message.Message):
-    __slots__ = ("track_id", "fallback", "paths", "mixture")
+    __slots__ = ("track_id", "fallback", "paths", "mixture", "corridor_probability", "corridor_time_s")
     TRACK_ID_FIELD_NUMBER: _ClassVar[int]
     FALLBACK_FIELD_NUMBER: _ClassVar[int]
     PATHS_FIELD_NUMBER: _ClassVar[int]
     MIXTURE_FIELD_NUMBER: _ClassVar[int]
+    CORRIDOR_PROBABILITY_FIELD_NUMBER: _ClassVar[int]
+    CORRIDOR_TIME_S_FIELD_NUMBER: _ClassVar[int]
     track_id: int
     fallback: bool
     paths: _containers.RepeatedCompositeFieldContainer[ModalPath]
     mixture: Mixture
-    def __init__(self, track_id: _Optional[int] = ..., fallback: _Optional[bool] = ..., paths: _Optional[_Iterable[_Union[ModalPath, _Mapping]]] = ..., mixture: _Optional[_Union[Mixture, _Mapping]] = ...) -> None: ...
+    corridor_probability: float
+    corridor_time_s: float
+    def __init__(self, track_id: _Optional[int] = ..., fallback: _Optional[bool] = ..., paths: _Optional[_Iterable[_Union[ModalPath, _Mapping]]] = ..., mixture: _Optional[_Union[Mixture, _Mapping]] = ..., corridor_probability: _Optional[float] = ..., corridor_time_s: _Optional[float] = ...) -> None: ...
 
 class PredictionFrame(_message.Message):
-    __slots__ = ("sequence", "stamp_ns", "frame_id", "model", "dt_s", "predictions")
+    __slots__ = ("sequence", "stamp_ns", "frame_id", "model", "dt_s", "predictions", "vehicle_path")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     STAMP_NS_FIELD_NUMBER: _ClassVar[int]
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     MODEL_FIELD_NUMBER: _ClassVar[int]
     DT_S_FIELD_NUMBER: _ClassVar[int]
     PREDICTIONS_FIELD_NUMBER: _ClassVar[int]
+    VEHICLE_PATH_FIELD_NUMBER: _ClassVar[int]
     sequence: int
     stamp_ns: int
     frame_id: str
     model: str
     dt_s: float
     predictions: _containers.RepeatedCompositeFieldContainer[Prediction]
-    def __init__(self, sequence: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame_id: _Optional[str] = ..., model: _Optional[str] = ..., dt_s: _Optional[float] = ..., predictions: _Optional[_Iterable[_Union[Prediction, _Mapping]]] = ...) -> None: ...
+    vehicle_path: VehiclePath
+    def __init__(self, sequence: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame_id: _Optional[str] = ..., model: _Optional[str] = ..., dt_s: _Optional[float] = ..., predictions: _Optional[_Iterable[_Union[Prediction, _Mapping]]] = ..., vehicle_path: _Optional[_Union[VehiclePath, _Mapping]] = ...) -> None: ...
+
+class NodeHealth(_message.Message):
+    __slots__ = ("stamp_ns", "node", "model", "uptime_s", "rate_hz", "latency_p50_ms", "latency_p99_ms", "frames", "dropped", "late", "refused", "problem", "input_hz")
+    STAMP_NS_FIELD_NUMBER: _ClassVar[int]
+    NODE_FIELD_NUMBER: _ClassVar[int]
+    MODEL_FIELD_NUMBER: _ClassVar[int]
+    UPTIME_S_FIELD_NUMBER: _ClassVar[int]
+    RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    LATENCY_P50_MS_FIELD_NUMBER: _ClassVar[int]
+    LATENCY_P99_MS_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    DROPPED_FIELD_NUMBER: _ClassVar[int]
+    LATE_FIELD_NUMBER: _ClassVar[int]
+    REFUSED_FIELD_NUMBER: _ClassVar[int]
+    PROBLEM_FIELD_NUMBER: _ClassVar[int]
+    INPUT_HZ_FIELD_NUMBER: _ClassVar[int]
+    stamp_ns: int
+    node: str
+    model: str
+    uptime_s: float
+    rate_hz: float
+    latency_p50_ms: float
+    latency_p99_ms: float
+    frames: int
+    dropped: int
+    late: int
+    refused: int
+    problem: str
+    input_hz: float
+    def __init__(self, stamp_ns: _Optional[int] = ..., node: _Optional[str] = ..., model: _Optional[str] = ..., uptime_s: _Optional[float] = ..., rate_hz: _Optional[float] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., frames: _Optional[int] = ..., dropped: _Optional[int] = ..., late: _Optional[int] = ..., refused: _Optional[int] = ..., problem: _Optional[str] = ..., input_hz: _Optional[float] = ...) -> None: ...
 
 class GroundTruthFrame(_message.Message):
     __slots__ = ("stamp_ns", "frame_id", "id", "x", "y", "vx", "vy", "lidar_points")

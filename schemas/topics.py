@@ -18,19 +18,20 @@ class Topic:
 
 
 INPUTS = (
-    *(Topic(f"/gmsl/{camera}/detections", "camera detections", "CameraDetections") for camera in CAMERAS),
-    *(Topic(f"/gmsl/{camera}/camera_info", "camera calibration", "CameraCalibration") for camera in CAMERAS),
-    *(Topic(f"/gmsl/{camera}/image", "camera image", "CompressedImage") for camera in CAMERAS),
-    Topic("/velodyne/front/clusters", "lidar clusters", "LidarClusters"),
-    Topic("/vn100/odometry", "vehicle pose", "VehiclePose"),
+    *(Topic(f"/gmsl/{camera}/detections", "camera", "CameraDetections") for camera in CAMERAS),
+    *(Topic(f"/gmsl/{camera}/camera_info", "calibration", "CameraCalibration") for camera in CAMERAS),
+    *(Topic(f"/gmsl/{camera}/image", "image", "CompressedImage") for camera in CAMERAS),
+    Topic("/velodyne/front/clusters", "clusters", "LidarClusters"),
+    Topic("/velodyne/front/points", "points", "PointCloud"),
+    Topic("/vn100/odometry", "pose", "VehiclePose"),
     Topic("/tf", "transforms", "Transform"),
-    Topic("/tf_static", "static transforms", "Transform"),
-    Topic("/simulation/ground_truth", "ground truth", "GroundTruthFrame"),
+    Topic("/tf_static", "transforms", "Transform"),
+    Topic("/simulation/ground_truth", "truth", "GroundTruthFrame"),
 )
 
 TRACKS = Topic("/pcgan/tracks", "tracks", "TrackFrame")
 PREDICTIONS = Topic("/pcgan/predictions", "predictions", "PredictionFrame")
-VEHICLE_POSE = Topic("/pcgan/vehicle_pose", "vehicle pose", "VehiclePose")
+VEHICLE_POSE = Topic("/pcgan/vehicle_pose", "pose", "VehiclePose")
 SCENE = Topic("/pcgan/scene", "drawing", "foxglove.SceneUpdate")
 OUTPUTS = (TRACKS, VEHICLE_POSE, PREDICTIONS, SCENE)
 

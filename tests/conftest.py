@@ -107,6 +107,7 @@ def edit_log(tmp_path):
         change: Callable[[list[tuple[str, int, bytes]]], Iterable[tuple[str, int, bytes]]],
         name: str = "edited.mcap",
         topics: Mapping[str, str] = MappingProxyType({}),  # old name -> new name
+        schemas: Mapping[str, str] = MappingProxyType({}),  # a topic that `change` adds -> one with its schema
         **options,  # of mcap.writer.Writer
     ) -> Path:
         found, schema_of, declared = [], {}, {}
@@ -121,7 +122,7 @@ def edit_log(tmp_path):
             writer.start(profile="", library="pcgan tests")
             for topic, log_time_ns, data in change(found):
                 if topic not in declared:
-                    schema = schema_of[topic]
+                    schema = schema_of[schemas.get(topic, topic)]
                     identifier = writer.register_schema(schema.name, schema.encoding, schema.data)
                     declared[topic] = writer.register_channel(topics.get(topic, topic), "protobuf", identifier)
                 writer.add_message(declared[topic], log_time_ns, data, log_time_ns, numbers[topic])

@@ -6,6 +6,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import tomllib
 from dataclasses import fields
 from pathlib import Path
 
@@ -17,15 +18,17 @@ from pcgan.checkpoint import DEFAULT_CHECKPOINT
 from pcgan.dataset import HELD_OUT_CLIPS, VALIDATION_CLIPS
 from replay import PredictorChoice, Replay
 from replay.cli import app
-from replay.decoders import DECODERS
+from replay.object_tracks import ObjectTracksParams
 from replay.record import Summary, record
-from replay.roles import schemas_for
+from replay.roles import WHAT, schemas_for
+from replay.session import ReplaySettings
 from replay.simulator.sensor_model import SensorModelV1
 from replay.time_sync import SyncSettings
 from schemas import pcgan_v1_pb2 as pb
 from schemas import topics
 from tracking.metrics import TrackingScore
 from tracking.pipeline import TrackingSettings
+from tracking.segmentation import SegmentationParams
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -110,10 +113,10 @@ def test_shown_commands_exist_and_parse(page, line):  # noqa: ARG001  names the 
     elif program == "make":
         assert re.search(rf"^{arguments[0]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
     elif program == "python":
-        assert arguments[0] == "-m"
-        assert (ROOT / f"{arguments[1].replace('.', '/')}.py").is_file()
+        script = f"{arguments[1].replace('.', '/')}.py" if arguments[0] == "-m" else arguments[0]
+        assert (ROOT / script).is_file()
     else:
-        assert program in {"rerun", "apt-get", "ruff", "mypy", "pytest"}
+        assert program in {"rosbags-convert", "rerun", "apt-get", "ruff", "mypy", "pytest"}
 
 
 @pytest.mark.parametrize("name", sorted({*COMMANDS, *LEAVES}))
@@ -178,11 +181,18 @@ def spelled_out(text):
     return [found[1] + part + found[3] for part in found[2].split(",")] if found else [text]
 
 
-def test_recording_page_has_every_input_with_every_message_it_may_be():
-    table = rows(sections(DOCS / "recording.md")["Topics"])[1:]
-    documented = {name: set(code_of(row[2])) for row in table for cell in code_of(row[1]) for name in spelled_out(cell)}
-    assert documented == {topic.name: set(schemas_for(topic)) for topic in topics.INPUTS}
-    assert all(schemas <= set(DECODERS) for schemas in documented.values())
+def test_recording_page_has_every_role_with_every_message_it_may_be():
+    table = rows(sections(DOCS / "recording.md")["Roles"].split("```")[0])[1:]
+    documented = {code_of(row[0])[0]: {*code_of(row[3]), *code_of(row[4])} for row in table}
+    assert documented == {role: set(schemas_for(role)) for role in WHAT}
+    defaults = {(code_of(row[0])[0], name) for row in table for cell in code_of(row[2]) for name in spelled_out(cell)}
+    assert defaults == {(topic.role, topic.name) for topic in topics.INPUTS}
+
+
+def test_the_profile_shown_is_one():
+    (text,) = blocks(DOCS / "recording.md", "toml")
+    shown = ReplaySettings.model_validate(tomllib.loads(text))
+    assert shown.roles.cameras["front"].detections == "/yolo/front"
 
 
 def test_readme_has_every_output():
@@ -208,6 +218,8 @@ def shown_default(value):
         return "on" if value else "off"
     if isinstance(value, tuple | dict):
         return ", ".join(value) or "none"
+    if value is None or isinstance(value, str):
+        return value or "none"
     return f"{value:g}"
 
 
@@ -217,6 +229,17 @@ def test_tracking_page_has_every_setting_with_its_default():
     wanted = dict([*settings_of(TrackingSettings), *settings_of(SyncSettings)])
     shown = {name: shown_default(value) for name, value in wanted.items()}
     assert documented == shown
+    assert all(row[2] for row in table)
+
+
+@pytest.mark.parametrize(
+    ("page", "heading", "model"),
+    [("tracking.md", "Points", SegmentationParams), ("recording.md", "Another tracker's tracks", ObjectTracksParams)],
+)
+def test_pages_have_every_setting_of_other_inputs(page, heading, model):
+    table = rows(sections(DOCS / page)[heading])
+    documented = {code_of(row[0])[0]: row[1] for row in table if row[0].startswith("`")}
+    assert documented == {name: shown_default(value) for name, value in settings_of(model)}
     assert all(row[2] for row in table)
 
 

@@ -23,6 +23,7 @@ def simulate(
     pedestrians: int,
     duration_s: float | None,
     seed: int,
+    points: bool = False,
     progress: Progress | None = None,
 ) -> DriveSummary:
     """Writes a simulated drive; the same arguments give the same bytes.
@@ -34,6 +35,7 @@ def simulate(
         pedestrians: how many people there are around the vehicle; a clip has its own.
         duration_s: how long; None: 60 s of a crowd, or all of a clip. A clip ends when its vehicle leaves.
         seed: of the crowd and of the sensors, 0 or more.
+        points: the LiDAR's raw points, too; every other message stays what it is without them.
         progress: called now and then with the fraction done.
 
     Raises SimulationError saying what to ask for instead; pcgan.clips.DataNotFound where a clip's data set is not on
@@ -55,6 +57,9 @@ def simulate(
         motion = clip_motion(clip, vehicle, seed)
         is_file = clip.endswith(TRAJECTORY_SUFFIXES)
         settings = {"clip": Path(clip).name if is_file else clip, "vehicle": vehicle, "duration_s": duration_s}
+    settings["seed"] = seed
+    if points:
+        settings["points"] = True
     return drive.simulate(
-        motion, output, seed, duration_s=duration_s, settings={**settings, "seed": seed}, progress=progress
+        motion, output, seed, duration_s=duration_s, settings=settings, points=points, progress=progress
     )

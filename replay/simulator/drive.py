@@ -13,6 +13,7 @@ from typing import BinaryIO
 
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration as FoxgloveCalibration
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms as FoxgloveTransforms
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud as FoxglovePointCloud
 from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
@@ -25,6 +26,7 @@ from replay.simulator.sensor_suite import (
     GROUND_TRUTH_TOPIC,
     NS_PER_S,
     ODOMETRY_TOPIC,
+    POINTS_TOPIC,
     START_NS,
     TF_STATIC_TOPIC,
     TF_TOPIC,
@@ -59,6 +61,7 @@ def simulate(
     duration_s: float | None = None,
     settings: dict[str, object] | None = None,
     model: SensorModelV1 | None = None,
+    points: bool = False,
     progress: Progress | None = None,
 ) -> DriveSummary:
     """Writes a drive through a motion and returns what it holds.
@@ -69,6 +72,7 @@ def simulate(
         seed: of all sensor randomness; not negative.
         duration_s: stops earlier than the motion.
         settings: what the motion was made from, for the metadata record "pcgan.simulation".
+        points: the LiDAR's raw points, too, on a topic of their own; no other message changes.
         progress: called now and then with the fraction that is done.
 
     Raises SimulationError for a seed or a folder that cannot be; OSError if writing fails.
@@ -91,7 +95,7 @@ def simulate(
     }
     try:
         with partial.open("wb") as stream:
-            suite = SensorSuite(motion, duration, seed, sensors, campus_rig())
+            suite = SensorSuite(motion, duration, seed, sensors, campus_rig(), points=points)
             messages = _write(stream, suite, metadata, duration, progress)
         partial.replace(output)
     finally:
@@ -106,7 +110,7 @@ def _write(
     writer = Writer(stream, compression=CompressionType.ZSTD, enable_crcs=True)
     writer.start(profile="", library=LIBRARY)
     writer.add_metadata(METADATA, metadata)
-    channels = _register(writer, suite.rig)
+    channels = _register(writer, suite.rig, points=suite.has_points)
     written: Counter[str] = Counter()
     reported = 0
     for logged in suite.logged():
@@ -124,7 +128,7 @@ def _write(
     return written
 
 
-def _register(writer: Writer, rig: Rig) -> dict[str, int]:
+def _register(writer: Writer, rig: Rig, *, points: bool) -> dict[str, int]:
     """Registers every topic with its schema, in a fixed order; returns the channels' ids."""
     ours: list[tuple[str, type]] = [
         *((f"/gmsl/{camera.name}/detections", CameraDetections) for camera in rig.cameras),
@@ -137,6 +141,7 @@ def _register(writer: Writer, rig: Rig) -> dict[str, int]:
         *((f"/gmsl/{camera.name}/camera_info", FoxgloveCalibration) for camera in rig.cameras),
         (TF_TOPIC, FoxgloveTransforms),
         (TF_STATIC_TOPIC, FoxgloveTransforms),
+        *([(POINTS_TOPIC, FoxglovePointCloud)] if points else []),
     ]
     schemas: dict[str, int] = {}
     channels: dict[str, int] = {}

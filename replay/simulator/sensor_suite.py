@@ -12,6 +12,7 @@ from replay.simulator.detector_model import SimulatedDetector
 from replay.simulator.lidar_model import SimulatedLidar
 from replay.simulator.motion import Motion, MotionSampler, Scene
 from replay.simulator.odometry_model import SimulatedOdometry
+from replay.simulator.point_cloud import SimulatedPoints
 from replay.simulator.rig import ODOMETRY_FRAME, Rig
 from replay.simulator.sensor_model import SensorModelV1
 from replay.simulator.visibility import Objects, ObjectTable
@@ -21,6 +22,7 @@ from schemas.messages import CameraCalibration, GroundTruthFrame, Transform
 NS_PER_S = 1_000_000_000
 START_NS = 1_583_114_400 * NS_PER_S  # 2020-03-02T02:00:00Z
 CLUSTERS_TOPIC = "/velodyne/front/clusters"
+POINTS_TOPIC = "/velodyne/front/points"
 ODOMETRY_TOPIC = "/vn100/odometry"
 TF_TOPIC, TF_STATIC_TOPIC = "/tf", "/tf_static"
 GROUND_TRUTH_TOPIC = "/simulation/ground_truth"
@@ -50,10 +52,13 @@ class _Tick(NamedTuple):
 class SensorSuite:
     """Turns a motion into messages. Each sensor has randomness of its own: none depends on what another does."""
 
-    def __init__(self, motion: Motion, duration_s: float, seed: int, model: SensorModelV1, rig: Rig):
+    def __init__(
+        self, motion: Motion, duration_s: float, seed: int, model: SensorModelV1, rig: Rig, *, points: bool = False
+    ):
         self.scans = 0
         self.people: set[int] = set()  # everybody within the ground truth's range so far
         self.rig = rig
+        self.has_points = points
         self._model = model
         self._duration_s = duration_s
         self._sampler = MotionSampler(motion)
@@ -64,6 +69,7 @@ class SensorSuite:
         self._delay_rngs = {sensor: np.random.default_rng([seed, 11, i]) for i, sensor in enumerate(sensors)}
         rngs = {sensor: np.random.default_rng([seed, 12, i]) for i, sensor in enumerate(sensors)}
         self._lidar = SimulatedLidar(rig.vehicle_from_lidar, model, rngs["lidar"])
+        self._points = SimulatedPoints(rig.vehicle_from_lidar, model, np.random.default_rng([seed, 13]))
         self._odometry = SimulatedOdometry(model, rngs["odometry"])
         self._detectors = {c.name: SimulatedDetector(c, model, rngs[c.name]) for c in rig.cameras}
 
@@ -169,6 +175,9 @@ class SensorSuite:
         self.people.update(people.ids[near].tolist())
         arrival_ns = self._arrival_ns(tick, model.lidar_delay_s, model.lidar_delay_jitter_s)
         yield self._message(tick.stamp_ns + _TRUTH_DELAY_NS, GROUND_TRUTH_TOPIC, codec.encode(truth))
+        if self.has_points:  # they arrive with the clusters, so that a log of either alone is released alike
+            cloud = self._points.scan(scene, objects, tick.stamp_ns)
+            yield self._message(arrival_ns, POINTS_TOPIC, foxglove.encode(cloud))
         yield self._message(arrival_ns, CLUSTERS_TOPIC, codec.encode(scan.clusters))
 
     def _camera_messages(

@@ -431,7 +431,7 @@ def test_a_rebuilt_file_is_copied_from_another_data_folder(server, tmp_path, alo
 
 def test_the_cache_is_looked_at_last(alone, tmp_path, monkeypatch):
     with pytest.raises(
-        clips.DataNotFound, match=r"pcgan/data; download them \(`pcgan data get dut`\), or set PCGAN_DATA"
+        clips.DataNotFound, match=r"pcgan/data; download them \(`pcgan data get NAME`\), or set PCGAN_DATA"
     ):
         clips.data_folder()
     (alone / "dut" / "trajectories_filtered").mkdir(parents=True)

@@ -12,7 +12,7 @@ from pcgan.history import observations
 from pcgan.model import POOLINGS
 from pcgan.predictor import USUAL_SIGMA_M, Predictor, excess
 from schemas import codec
-from schemas.messages import PredictionFrame, TrackHistory, VehicleHistory
+from schemas.messages import PredictionFrame, TrackHistory, VehicleHistory, VehiclePath
 
 
 @pytest.fixture
@@ -23,6 +23,7 @@ def predictor(make_generator):
 def test_empty_frame_gets_an_empty_answer(predictor, make_frame):
     answer = predictor.step(make_frame(sequence=17))
     assert vars(answer) == vars(PredictionFrame(17, make_frame().stamp_ns, "odom", "random", 0.1, ()))
+    assert predictor.step(make_frame(vehicle_speed_mps=2.0)).vehicle_path is not None
 
 
 def test_answer_is_a_sound_message(predictor, make_frame, make_track):
@@ -284,6 +285,77 @@ def test_badly_known_track_has_a_wider_mixture_around_the_same_path(predictor, m
     np.testing.assert_array_equal(same_path, path)
     np.testing.assert_allclose(worse[..., 0], np.sqrt(usual[..., 0] ** 2 + 0.5 - USUAL_SIGMA_M**2), rtol=1e-5)
     np.testing.assert_allclose(worse[..., 1], usual[..., 1], rtol=1e-5)
+
+
+# --- the vehicle's corridor ------------------------------------------------------------------------------------------
+
+
+def risks(answer):
+    return [(p.corridor_probability, p.corridor_time_s) for p in answer.predictions]
+
+
+def test_corridor_is_the_present_motion_carried_on(predictor, make_frame, make_track):
+    """At 4 m/s along y = -3: one stands ahead, one aside, one behind; the horizon is 1.2 s."""
+    places = {1: (5, -3), 2: (5, 3), 3: (-4, -3), 4: (2.4 + 4.8 + 2, -3)}
+    tracks = [make_track(id=i, position=place, velocity=(0, 0)) for i, place in places.items()]
+    answer = predictor.step(make_frame(*tracks, vehicle_speed_mps=4.0))
+    (ahead, now_s), *others = risks(answer)
+    assert ahead == pytest.approx(1, abs=1e-6)
+    assert now_s == pytest.approx(0, abs=0.01)
+    assert others == [(0, None)] * 3
+    path = answer.vehicle_path
+    np.testing.assert_allclose(path.times_s, 0.1 * np.arange(13))
+    np.testing.assert_allclose(path.poses, [[0.4 * i, -3, 0] for i in range(13)], atol=1e-9)
+    decoded = codec.decode(PredictionFrame, codec.encode(answer))
+    assert risks(decoded) == risks(answer)
+    np.testing.assert_array_equal(decoded.vehicle_path.poses, path.poses)
+
+
+def test_given_path_changes_the_corridor_and_nothing_else(predictor, make_frame, make_track):
+    tracks = [make_track(id=1, position=(5, -3), velocity=(0, 0)), make_track(id=2, position=(0, 1), age_s=0.0)]
+    frame = make_frame(*tracks, vehicle_speed_mps=4.0)
+    to_the_left = VehiclePath(np.array([0, 1.2]), np.array([[0, -3, 1.57], [0, 3, 1.57]]), 2.4, 0.6, 1.4)
+    driven_on, supposed = predictor.step(frame), predictor.step(replace(frame, vehicle_path=to_the_left))
+    assert [p > 0.99 for p, _ in risks(driven_on)] == [True, False]
+    assert [p > 0.99 for p, _ in risks(supposed)] == [False, True]  # the fallback has figures, too
+    assert supposed.vehicle_path is to_the_left
+    plain = [replace(p, corridor_probability=0, corridor_time_s=None) for p in driven_on.predictions]
+    same = [replace(p, corridor_probability=0, corridor_time_s=None) for p in supposed.predictions]
+    assert codec.encode(replace(driven_on, predictions=tuple(plain), vehicle_path=None)) == codec.encode(
+        replace(supposed, predictions=tuple(same), vehicle_path=None)
+    )
+
+
+def test_without_a_vehicle_nobody_enters_unless_a_path_is_given(predictor, make_frame, make_track):
+    frame = make_frame(make_track(velocity=(0, 0)))
+    answer = predictor.step(frame)
+    assert (risks(answer), answer.vehicle_path) == ([(0, None)], None)
+    standing = VehiclePath(np.zeros(1), np.zeros((1, 3)), 2.4, 0.6, 1.4)
+    [(probability, time_s)] = risks(predictor.step(replace(frame, vehicle_path=standing)))
+    assert probability == pytest.approx(1, abs=1e-6)
+    assert time_s == pytest.approx(0, abs=0.01)
+
+
+def test_crossing_in_time_is_expected_when_it_happens(make_generator, make_frame, make_track):
+    """The fallback walks straight on: 2 m/s towards the edge at y = -2, from 2 m away."""
+    predictor = Predictor(make_generator(), "random", "")
+    track = make_track(position=(6, 0), velocity=(0, -2), age_s=0.0)
+    track = replace(track, covariance=1e-6 * np.eye(4))
+    [(probability, time_s)] = risks(predictor.step(make_frame(track, vehicle_speed_mps=4.0)))
+    assert probability > 0.75  # 0.2 s are left, and it may slow down
+    assert time_s == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("broken", [np.nan, np.inf])
+def test_path_that_is_not_finite_is_refused(predictor, make_frame, make_track, broken):
+    for path in (
+        VehiclePath(np.array([0, broken]), np.zeros((2, 3)), 2.4, 0.6, 1.4),
+        VehiclePath(np.zeros(1), np.array([[broken, 0, 0]]), 2.4, 0.6, 1.4),
+        VehiclePath(np.zeros(0), np.zeros((0, 3)), 2.4, 0.6, 1.4),
+        VehiclePath(np.zeros(1), np.zeros((1, 3)), 2.4, 0.6, broken),
+    ):
+        with pytest.raises(ValueError, match="the vehicle's path has no poses, or holds NaN or infinity"):
+            predictor.step(replace(make_frame(make_track()), vehicle_path=path))
 
 
 # --- what is not finite ----------------------------------------------------------------------------------------------

@@ -47,7 +47,8 @@ def inline(pcgan, model):
 
 def test_the_commands():
     words = {name[0] for name in COMMANDS}
-    drives = {"replay", "simulate", "predict", "info", "inspect", "label"}
+    drives = {"replay", "simulate", "predict", "info", "inspect", "label", "export"}
+    drives |= {"track", "play", "record", "whatif"}
     assert words == drives | {"models", "train", "windows", "evaluate", "data"}
     assert {("data", "list"), ("data", "get")} <= set(COMMANDS)
 
@@ -69,7 +70,7 @@ def test_pcgan_alone_lists_the_commands(pcgan):
     assert outcome.code == 0
     for name in COMMANDS:
         assert f"│ {name[0]} " in outcome.out
-    for panel in ("Drives", "Models", "Data"):
+    for panel in ("Drives", "Live", "Models", "Data"):
         assert f"─ {panel} ─" in outcome.out
 
 
@@ -128,7 +129,7 @@ def test_refused_messages_are_exit_3_with_a_closing_line(inline, short_drive, ed
     outcome = inline(path, "-o", tmp_path / "out.mcap", "--json", tmp_path / "summary.json")
     assert outcome.code == 3
     assert f"{CLUSTERS_TOPIC} at " in outcome.out
-    assert "1 messages were refused" in outcome.out
+    assert "1 message was refused" in outcome.out
     (row,) = json.loads((tmp_path / "summary.json").read_text())["refusals"]
     assert (row["topic"], row["count"]) == (CLUSTERS_TOPIC, 1)
     assert "not a pcgan.v1.LidarClusters" in row["reason"]
@@ -177,26 +178,40 @@ def test_a_log_that_is_none_is_one_line_and_nothing_is_written(inline, tmp_path,
 
 
 def test_a_missing_topic_is_one_line_and_nothing_is_written(inline, short_drive, edit_log):
-    path = edit_log(short_drive, lambda log: [m for m in log if m[0] != ODOMETRY_TOPIC])
+    path = edit_log(short_drive, lambda log: [m for m in log if m[0] not in (ODOMETRY_TOPIC, "/tf")])
     outcome = inline(path)
     assert outcome.code == 2
     assert "the log has no vehicle pose: looked for /vn100/odometry" in one_line(outcome.err)
     assert [each.name for each in path.parent.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize("option", ["/vn100/odometry", "a=b", ":=/odom", "/vn100/odometry:="])
-def test_a_remap_that_is_none_shows_an_example(inline, short_drive, option):
-    outcome = inline(short_drive, "--topic", option)
+@pytest.mark.parametrize("option", ["/vn100/odometry", "a=b", ":=/odom", "pose:="])
+def test_a_role_that_is_none_shows_an_example(inline, short_drive, option):
+    outcome = inline(short_drive, "--role", option)
     assert outcome.code == 2
-    assert one_line(outcome.err) == (
-        f"pcgan: --topic wants NAME:=NAME, for example /vn100/odometry:=/odom; got {option!r}"
-    )
+    assert one_line(outcome.err) == (f"pcgan: --role wants ROLE:=TOPIC, for example pose:=/odom; got {option!r}")
 
 
-def test_a_remap_is_used(inline, short_drive, edit_log, tmp_path):
+def test_a_role_is_used(inline, short_drive, edit_log, tmp_path):
     renamed = edit_log(short_drive, lambda log: log, topics={ODOMETRY_TOPIC: "/odom"})
-    arguments = (renamed, "-o", tmp_path / "out.mcap", "--duration", "0.5", "--topic")
-    assert inline(*arguments, f"{ODOMETRY_TOPIC}:=/odom").code == 0
+    arguments = (renamed, "-o", tmp_path / "out.mcap", "--duration", "0.5", "--role")
+    assert inline(*arguments, "pose:=/odom").code == 0
+    outcome = inline(*arguments, f"pose:={CLUSTERS_TOPIC}")
+    assert outcome.code == 2
+    assert f"{CLUSTERS_TOPIC} cannot serve as vehicle pose" in one_line(outcome.err)
+
+
+def test_a_profile_in_toml_gives_roles_and_settings(inline, short_drive, tmp_path, mcap_content):
+    profile = tmp_path / "car.toml"
+    profile.write_text(f'duration_s = 0.5\n[roles]\npose = "{ODOMETRY_TOPIC}"\n[sync]\nwait_ms = 250\n')
+    assert inline(short_drive, "-o", tmp_path / "out.mcap", "--profile", profile).code == 0
+    used = json.loads(mcap_content(tmp_path / "out.mcap").attachments["settings.json"])
+    assert (used["duration_s"], used["roles"]["pose"], used["sync"]["wait_ms"]) == (0.5, ODOMETRY_TOPIC, 250)
+    for text, words in (("[roles", "is not TOML"), ("speed = 1", "is no profile: speed: Extra inputs")):
+        profile.write_text(text)
+        outcome = inline(short_drive, "--profile", profile)
+        assert outcome.code == 2
+        assert words in one_line(outcome.err)
 
 
 @pytest.mark.parametrize("predictor", ["inline", "spawned"])
@@ -209,9 +224,15 @@ def test_a_corrupt_checkpoint_is_one_line_naming_the_file(pcgan, short_drive, tm
     assert not list(tmp_path.glob("out*"))
 
 
+@pytest.mark.parametrize(
+    ("option", "value"), [("--connect", "tcp/127.0.0.1:1"), ("--zenoh-config", "tls.json5"), ("--namespace", "car7")]
+)
+def test_options_of_an_external_predictor_are_of_no_other(inline, short_drive, option, value):
+    outcome = inline(short_drive, option, value)
+    assert (outcome.code, one_line(outcome.err)) == (2, f"pcgan: {option} goes with --predictor external")
+
+
 def test_options_that_exclude_each_other(inline, short_drive):
-    outcome = inline(short_drive, "--connect", "tcp/127.0.0.1:1")
-    assert (outcome.code, one_line(outcome.err)) == (2, "pcgan: --connect goes with --predictor external")
     outcome = inline(short_drive, "--rrd", "a.rrd", "--view")
     assert outcome.code == 2
     assert "--rrd and --view exclude each other" in one_line(outcome.err)
@@ -339,7 +360,7 @@ def test_info_as_a_table_and_as_json(pcgan, short_drive):
     table = pcgan("info", short_drive)
     assert table.code == 0
     assert CLUSTERS_TOPIC in table.out
-    assert "lidar clusters" in table.out
+    assert "clusters" in table.out
     assert "\x1b" not in table.out + table.err
     outcome = pcgan("info", short_drive, "--json")
     assert outcome.code == 0
@@ -353,7 +374,7 @@ def test_info_of_a_log_that_cannot_be_replayed_is_exit_2_with_its_topics(pcgan, 
     outcome = pcgan("info", path)
     assert outcome.code == 2
     assert ODOMETRY_TOPIC in outcome.out
-    assert "cannot be replayed: the log has no lidar clusters" in outcome.out
+    assert "cannot be replayed: the log has no LiDAR clusters" in outcome.out
 
 
 def test_info_of_no_log_is_one_line(pcgan, tmp_path):

@@ -112,7 +112,7 @@ def test_mistakes_are_one_line(pcgan, short_drive, tmp_path):
     )
     settings = tmp_path / "settings.json"
     settings.write_text('{"start_s": 2}')
-    line = one_line(pcgan("inspect", short_drive, "--at", "1.2", "--settings", settings))
+    line = one_line(pcgan("inspect", short_drive, "--at", "1.2", "--profile", settings))
     assert "--at 1.2 lies before the start, 2 s into the log" in line
     assert "no frame within 1 s of --at 50" in one_line(pcgan("inspect", short_drive, "--at", "50"))
     assert "/odom can have no time offset; topics with stamps that count are /gmsl/A0/detections" in one_line(

@@ -4,13 +4,15 @@ import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage as FoxgloveImage
 
 from replay import foxglove
-from replay.decoders import DECODERS
+from replay.decoders import PROTOBUF as DECODERS
+from replay.decoders import decoders_for, schemas_of
+from replay.logged_message import LoggedSchema
 from schemas import codec, messages, topics
 from schemas.codec import CodecError
 
 
 def test_every_decoder_names_a_dataclass_that_some_topic_carries():
-    carried = {topic.message for topic in (*topics.INPUTS, *topics.OUTPUTS)}
+    carried = {topic.message for topic in (*topics.INPUTS, *topics.OUTPUTS)} | {"NodeHealth"}
     for schema, (name, _) in DECODERS.items():
         assert hasattr(messages, name), schema
         assert name in carried, schema
@@ -45,3 +47,15 @@ def test_an_image_is_passed_through(make):
 def test_bytes_that_are_something_else_raise_a_codec_error(schema):
     with pytest.raises(CodecError):
         DECODERS[schema][1](b"\xff\xff\xff\xff")
+
+
+def test_schemas_nobody_knows_have_no_decoder():
+    for name, kind, encoding in (("x.Y", "protobuf", "protobuf"), ("x/Y", "ros2msg", "cdr"), ("", "", "")):
+        assert decoders_for(LoggedSchema(name, kind, b""), encoding) == ()
+    ours = LoggedSchema("pcgan.v1.VehiclePose", "protobuf", b"")
+    assert [way.message for way in decoders_for(ours, "protobuf")] == ["VehiclePose"]
+    assert decoders_for(ours, "cdr") == ()
+
+
+def test_the_families_of_a_message_are_listed_together():
+    assert {"pcgan.v1.VehiclePose", "foxglove.Odometry", "foxglove.PoseInFrame"} <= set(schemas_of("VehiclePose"))

@@ -32,7 +32,7 @@ def test_one_is_not_several():
 
 def recording(*cameras: CameraCheck) -> RecordingReport:
     names = [check.topic for check in cameras]
-    topics = [TopicTiming(name, "camera detections", 9, 0, 30.0, 0.5, None, None, 1.0, 0, 0.03, 1.0) for name in names]
+    topics = [TopicTiming(name, "camera", 9, 0, 30.0, 0.5, None, None, 1.0, 0, 0.03, 1.0) for name in names]
     return RecordingReport(tuple(topics), (), cameras, ())
 
 

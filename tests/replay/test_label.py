@@ -16,6 +16,7 @@ from replay.session import Replay, ReplaySettings
 from replay.simulator import simulate
 from replay.simulator.sensor_suite import CLUSTERS_TOPIC
 from replay.time_sync import SyncedFrame
+from tracking.pipeline import TrackingSettings
 from tracking.sensor_frame import SensorFrame
 
 
@@ -42,6 +43,7 @@ def run_of(frames, start=0):
     return SimpleNamespace(
         frames=lambda: iter(frames),
         settings=ReplaySettings(),
+        tracker=lambda: FrameTracker(TrackingSettings()),
         refusals=Refusals(),
         start_ns=begin + start * 100_000_000,
         reader=SimpleNamespace(start_ns=begin),
@@ -88,7 +90,7 @@ def test_what_is_later_than_that_is_refused(frames):
     refusals = Refusals()
     done = list(in_order([given[0], *given[2:], replace(given[1], late=True)], 3, refusals))
     assert done == [given[0], *given[2:]]
-    assert refusals.as_json() == [{"topic": "lidar clusters", "reason": "scan too late to use", "count": 1}]
+    assert refusals.as_json() == [{"topic": "scans", "reason": "scan too late to use", "count": 1}]
 
 
 def test_an_epoch_ends_before_the_next_begins(frames):
@@ -244,7 +246,13 @@ def test_clusters_that_fusion_drops_are_counted(frames):
 
 
 def test_no_scan_at_all_is_an_error():
-    run = SimpleNamespace(frames=lambda: [], settings=ReplaySettings(), refusals=Refusals(), start_ns=0)
+    run = SimpleNamespace(
+        frames=lambda: [],
+        settings=ReplaySettings(),
+        tracker=lambda: FrameTracker(TrackingSettings()),
+        refusals=Refusals(),
+        start_ns=0,
+    )
     with pytest.raises(LogError, match="nothing to label"):
         label(run)
 

@@ -4,10 +4,14 @@ import io
 import json
 
 import pytest
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from rich.console import Console
 
 from replay.errors import LogError
-from replay.log_info import describe_log, print_info
+from replay.log_info import delays_text, describe_log, print_info, timings
+from replay.log_reader import LogReader
+from replay.roles import RoleChoices
+from replay.session import ReplaySettings
 from replay.simulator.sensor_suite import CLUSTERS_TOPIC, ODOMETRY_TOPIC
 
 
@@ -17,7 +21,7 @@ def rows(description):
 
 def printed(description):
     stream = io.StringIO()
-    print_info(description, Console(file=stream, width=200))
+    print_info(description, Console(file=stream, width=240))
     return stream.getvalue()
 
 
@@ -33,7 +37,7 @@ def test_a_drive_is_described(short_drive):
     assert (scans["schema"], scans["encoding"], scans["role"]) == (
         "pcgan.v1.LidarClusters",
         "protobuf",
-        "lidar clusters",
+        "clusters",
     )
     assert scans["count"] == 30
     assert scans["rate_hz"] == pytest.approx(10, rel=0.1)
@@ -69,9 +73,12 @@ def test_a_log_that_cannot_be_replayed_says_why(make, make_log, logged):
     path = make_log([logged(ODOMETRY_TOPIC, make.stamp(t), make.pose(t)) for t in range(0, 100, 10)])
     description = describe_log([path])
     assert description["usable"] is False
-    assert "the log has no lidar clusters: looked for /velodyne/front/clusters" in description["problem"]
+    assert (
+        "the log has no LiDAR clusters and no LiDAR points: looked for /velodyne/front/clusters"
+        in description["problem"]
+    )
     assert rows(description)[ODOMETRY_TOPIC]["count"] == 10
-    assert "cannot be replayed: the log has no lidar clusters" in printed(description)
+    assert "cannot be replayed: the log has no LiDAR clusters" in printed(description)
 
 
 def test_topics_nobody_can_decode_are_listed(make, make_log, logged):
@@ -105,12 +112,23 @@ def test_a_transforms_message_without_a_transform_is_no_reason_to_stop(make, mak
     assert (row["count"], row["delay_ms"]) == (1, None)
 
 
-def test_remaps_give_roles(short_drive, edit_log):
-    renamed = edit_log(short_drive, lambda log: log, topics={ODOMETRY_TOPIC: "/odom"})
-    assert describe_log([renamed])["usable"] is False
-    description = describe_log([renamed], {ODOMETRY_TOPIC: "/odom"})
+def test_what_is_used_is_said_with_the_reason_and_what_could_be(short_drive, edit_log):
+    twice = edit_log(
+        short_drive,
+        lambda log: [m for t, at, d in log for m in ((t, at, d), ("/odom", at, d))[: 1 + (t == ODOMETRY_TOPIC)]],
+        topics={ODOMETRY_TOPIC: "/a"},
+        schemas={"/odom": ODOMETRY_TOPIC},
+    )
+    description = describe_log([twice])
+    assert description["usable"] is False
+    assert "2 topics could be the vehicle pose: /a, /odom" in description["problem"]
+    assert rows(description)["/odom"]["could_be"] == ["pose"]
+    assert "could be pose" in printed(description)
+    description = describe_log([twice], ReplaySettings(roles=RoleChoices(pose="/odom")))
     assert description["usable"] is True
-    assert rows(description)["/odom"]["role"] == "vehicle pose"
+    assert (rows(description)["/odom"]["role"], rows(description)["/odom"]["why"]) == ("pose", "chosen")
+    assert rows(description)["/a"]["role"] is None
+    assert rows(description)["/gmsl/A0/detections"]["camera"] == "A0"
 
 
 def test_the_table_has_a_line_per_topic(short_drive):
@@ -119,7 +137,7 @@ def test_the_table_has_a_line_per_topic(short_drive):
     for row in description["topics"]:
         assert row["topic"] in text
     assert "short.mcap: 3." in text
-    assert "lidar clusters" in text
+    assert "clusters" in text
     assert "cannot be replayed" not in text
 
 
@@ -132,3 +150,38 @@ def test_damage_is_shown_when_salvaged(short_drive, edit_log):
     description = describe_log([damaged], salvage=True)
     assert description["salvage_losses"]
     assert "damaged: damaged.mcap: nothing readable after byte" in printed(description)
+
+
+def test_a_topic_of_several_schemas_is_used_as_far_as_it_can_be_read(make, make_log, logged):
+    messages = [logged(ODOMETRY_TOPIC, make.stamp(t), make.pose(t)) for t in range(0, 100, 10)]
+    others = [logged(ODOMETRY_TOPIC, make.stamp(100), b"?", name) for name in ("a.Other", "z.Other")]
+    path = make_log([*messages, logged(CLUSTERS_TOPIC, make.stamp(50), make.scan(40)), *others])
+    found = [row for row in describe_log([path])["topics"] if row["topic"] == ODOMETRY_TOPIC]
+    assert [row["schema"] for row in found] == ["a.Other", "pcgan.v1.VehiclePose", "z.Other"]
+    assert {(row["role"], row["delay_ms"]["p99"]) for row in found} == {("pose", 0.0)}
+
+
+def test_what_has_no_stamp_or_an_impossible_log_time_has_no_delay(make, make_log, logged):
+    static = FrameTransform(parent_frame_id="base_link", child_frame_id="lidar", rotation={"w": 1.0})
+    messages = [
+        logged("/tf_static", make.stamp(0), static.SerializeToString(), "foxglove.FrameTransform"),
+        logged(ODOMETRY_TOPIC, make.stamp(30), make.pose(20)),
+        logged(ODOMETRY_TOPIC, 2**64 - 1, make.pose(30)),
+    ]
+    reader = LogReader([make_log(messages)])
+    found = timings(reader, 1e12)
+    assert len(found["/tf_static"][0]) == 0
+    assert found[ODOMETRY_TOPIC][1].tolist() == [10 * make.MS]
+
+
+def test_names_that_look_like_markup_are_printed_as_they_are(make, make_log, logged):
+    odd = logged("/a[/b]", make.stamp(0), b"?", "x[/red]")
+    text = printed(describe_log([make_log([odd, logged(ODOMETRY_TOPIC, make.stamp(0), make.pose(0))])]))
+    assert "/a[/b]" in text
+    assert "x[/red]" in text
+
+
+def test_delays_of_a_log_that_was_recorded_from_a_replay_are_told_in_days():
+    assert delays_text(56.4, 74.0) == "56 / 74"
+    assert delays_text(-250_000, -240_000) == "-250 / -240 s"
+    assert delays_text(212_533_842_295, 212_533_842_303) == "2460 / 2460 d"

@@ -1,6 +1,7 @@
 """Recordings in: order, several files, damage of every kind, and memory that does not grow with the log."""
 
 import io
+import threading
 import tracemalloc
 from collections import Counter
 
@@ -11,7 +12,8 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType
 
 from replay.errors import LogError
-from replay.log_reader import ChannelInfo, LogReader, checksum
+from replay.log_reader import LogReader, checksum
+from replay.logged_message import ChannelInfo, LoggedSchema
 
 MAGIC = b"\x89MCAP0\r\n"
 KINDS = {
@@ -21,6 +23,8 @@ KINDS = {
     "lz4": {"chunk_size": 600, "compression": CompressionType.LZ4},
     "unchunked": {"use_chunking": False},
 }
+
+SCHEMA = LoggedSchema("some.Schema", "protobuf", b"")
 
 
 @pytest.fixture
@@ -94,14 +98,14 @@ def test_topics_and_times_select(make_log, records, kind, salvage):
 
 def test_a_message_carries_what_the_file_says(make_log, records):
     first = next(LogReader([make_log(records)]).messages())
-    assert first == ("/a", 1_000_000_000, "some.Schema", "protobuf", b"payload 000")
+    assert first == ("/a", 1_000_000_000, SCHEMA, "protobuf", b"payload 000")
 
 
 def test_channels_are_counted_over_all_files(make_log, records):
     paths = [make_log(records[:20], "one.mcap"), make_log(records[20:], "two.mcap")]
     assert LogReader(paths).channels == (
-        ChannelInfo("/a", "some.Schema", "protobuf", 30),
-        ChannelInfo("/b", "some.Schema", "protobuf", 30),
+        ChannelInfo("/a", SCHEMA, "protobuf", 30),
+        ChannelInfo("/b", SCHEMA, "protobuf", 30),
     )
 
 
@@ -139,7 +143,23 @@ def test_checksum_is_sha256(tmp_path):
     assert checksum(tmp_path / "abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
+def test_a_checksum_can_be_abandoned(tmp_path):
+    (tmp_path / "abc").write_bytes(b"abc")
+    abandoned = threading.Event()
+    assert checksum(tmp_path / "abc", abandoned) == checksum(tmp_path / "abc")
+    abandoned.set()
+    assert checksum(tmp_path / "abc", abandoned) is None
+
+
 # --- files that are none ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("head", "kind"), [(b"#ROSBAG V2.0\n", "a ROS 1 bag"), (b"SQLite format 3\0", "a database")])
+def test_bags_of_other_kinds_are_named_with_the_way_out(tmp_path, head, kind):
+    (tmp_path / "week.bag").write_bytes(head + bytes(4000))
+    for salvage in (False, True):
+        with pytest.raises(LogError, match=f"week.bag is {kind}.*, not MCAP: rosbags-convert makes MCAP of it"):
+            LogReader([tmp_path / "week.bag"], salvage=salvage)
 
 
 @pytest.mark.parametrize(
@@ -271,7 +291,7 @@ def test_a_topic_declared_in_a_lost_chunk_is_known_from_the_summary(make_log, re
     data[first.chunk_start_offset + first.chunk_length - 5] ^= 0xFF
     path.write_bytes(data)
     reader = LogReader([path], salvage=True)
-    found = [(message.topic, message.schema_name, message.data) for message in reader.messages()]
+    found = [(message.topic, message.schema.name, message.data) for message in reader.messages()]
     expected = [(r.topic, r.schema, r.message) for r in records if r.log_time_ns > first.message_end_time]
     assert found == expected
     assert len(found) > 40

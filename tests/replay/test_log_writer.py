@@ -1,13 +1,17 @@
-"""Results out: what the file holds, its name while it is not whole, and places that cannot be written."""
+"""Results out: what the file holds, in which formats, its name while it is not whole, places that cannot be written."""
 
 import os
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.rosbag2 import Reader as Rosbag2Reader
 
+from replay import autoware
 from replay.errors import OutputError
-from replay.log_writer import LogWriter
+from replay.log_writer import DEFAULT_FORMATS, FORMATS, LogWriter, outputs
 from schemas import codec, topics
 from schemas.messages import PredictionFrame, TrackFrame, VehiclePose
 
@@ -22,8 +26,8 @@ def frame(make):
     return made
 
 
-def written(path, frames, lineage=None, settings=b"", ending=None):
-    with LogWriter(path) as writer:
+def written(path, frames, lineage=None, settings=b"", ending=None, emit=DEFAULT_FORMATS):
+    with LogWriter(path, emit=emit) as writer:
         for frame in frames:
             writer.write(frame)
         if lineage:
@@ -53,7 +57,6 @@ def test_messages_come_back_through_the_codec(tmp_path, frame, mcap_content):
 
 def test_schemas_travel_inside_the_file(tmp_path, frame):
     """Somebody without our code decodes the file by the descriptors in it."""
-    from mcap.reader import make_reader
     from mcap_protobuf.decoder import DecoderFactory
 
     path = written(tmp_path / "out.mcap", [frame(0)])
@@ -121,6 +124,73 @@ def test_ctrl_c_closes_the_file_under_its_name(tmp_path, frame, mcap_content):
 
 def test_missing_folders_are_made(tmp_path, frame):
     assert written(tmp_path / "a" / "b" / "out.mcap", [frame(0)]).is_file()
+
+
+# --- formats ---------------------------------------------------------------------------------------------------------
+
+AUTOWARE_TOPICS = [autoware.TRACKED_OBJECTS.name, autoware.PREDICTED_OBJECTS.name]
+
+
+def test_every_format_adds_its_topics_at_the_frames_log_time(tmp_path, frame, mcap_content):
+    frames = [frame(i) for i in range(3)]
+    content = mcap_content(written(tmp_path / "out.mcap", frames, emit=tuple(FORMATS)))
+    names = [topic.name for topic in topics.OUTPUTS if topic != topics.SCENE] + [topics.SCENE.name, *AUTOWARE_TOPICS]
+    assert [topic for topic, _, _ in content.messages] == names * 3
+    assert [at for _, at, _ in content.messages] == [f.log_time_ns for f in frames for _ in names]
+    assert content.header.profile == ""  # protobuf is in it, too
+
+
+def test_more_formats_change_nothing_of_the_others(tmp_path, frame, mcap_content):
+    frames = [frame(i) for i in range(3)]
+    usual = mcap_content(written(tmp_path / "usual.mcap", frames)).messages
+    more = mcap_content(
+        written(tmp_path / "more.mcap", frames, emit=("autoware", "foxglove", "pcgan", "pcgan"))
+    ).messages
+    assert [message for message in more if message[0] not in AUTOWARE_TOPICS] == usual
+
+
+def test_formats_may_be_named_in_any_order(tmp_path, frame):
+    one = written(tmp_path / "one.mcap", [frame(0)], emit=("autoware", "pcgan"))
+    assert one.read_bytes() == written(tmp_path / "other.mcap", [frame(0)], emit=("pcgan", "autoware")).read_bytes()
+
+
+def test_autoware_alone_is_a_ros2_file(tmp_path, frame, mcap_content):
+    """Two other libraries read it: rosbags, which takes nothing but the profile ros2, and mcap-ros2-support."""
+    sent = frame(3)
+    path = written(tmp_path / "out.mcap", [sent], {"model": "m"}, b"{}", emit=["autoware"])
+    content = mcap_content(path)
+    assert content.header.profile == "ros2"
+    assert {schema.encoding for schema in content.summary.schemas.values()} == {"ros2msg"}
+    assert set(content.metadata) == {"pcgan", "rosbag2"}
+    with Rosbag2Reader(path) as bag:
+        assert [connection.topic for connection in bag.connections] == AUTOWARE_TOPICS
+        assert [data for _, _, data in bag.messages()] == [data for _, _, data in content.messages]
+        for connection in bag.connections:
+            assert connection.ext.offered_qos_profiles[0].depth == 10
+    with path.open("rb") as stream:
+        decoded = list(make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
+    stamps = [message.decoded_message.header.stamp for message in decoded]
+    assert [(stamp.sec, stamp.nanosec) for stamp in stamps] == [divmod(sent.tracks.stamp_ns, 10**9)] * 2
+    first = decoded[0].decoded_message.objects[0].kinematics.pose_with_covariance.pose.position
+    assert (first.x, first.y) == tuple(sent.tracks.tracks[0].state[:2])
+
+
+def test_an_autoware_file_is_byte_identical_again(tmp_path, frame):
+    one, other = (
+        written(tmp_path / name, [frame(i) for i in range(5)], emit=["autoware"]) for name in ("one", "other")
+    )
+    assert one.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.parametrize(("emit", "problem"), [(["ros3"], "no output format 'ros3'"), ([], "no output format given")])
+def test_formats_nobody_knows_are_refused_before_anything_is_written(tmp_path, emit, problem):
+    with pytest.raises(OutputError, match=f"{problem}.*pcgan, foxglove, autoware"):
+        LogWriter(tmp_path / "out.mcap", emit=emit)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_usual_outputs_are_those_of_the_table_of_topics():
+    assert tuple(output.topic for output in outputs(DEFAULT_FORMATS)) == topics.OUTPUTS
 
 
 # --- places that cannot be written -----------------------------------------------------------------------------------

@@ -168,8 +168,8 @@ def test_a_scan_older_than_the_ring_is_refused_and_counted(frames):
     refusals = Refusals()
     found = list(run_pipeline([*given, late], tracker(), Echo(), refusals=refusals))
     assert len(found) == 30
-    assert refusals.counts == {("lidar clusters", "scan too late to use"): 1}
-    assert "lidar clusters at" in refusals.first[0]
+    assert refusals.counts == {("scans", "scan too late to use"): 1}
+    assert "scans at" in refusals.first[0]
 
 
 def test_strict_stops_at_a_scan_too_late(frames):

@@ -1,5 +1,7 @@
 """Poses between the logged ones: interpolation laws, a cross-check with scipy's Slerp, and where poses end."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -52,6 +54,13 @@ def test_halfway_is_halfway():
     found = at(buffer(pose(0, (0, 0, 0), turn(0.0)), pose(10, (2, 4, 0), turn(1.0))), 5, 2.5)
     np.testing.assert_allclose(found.map_from_vehicle[:, :3, 3], [[1, 2, 0], [0.5, 1, 0]], atol=1e-12)
     np.testing.assert_allclose(found.map_from_vehicle[0, :3, :3], turn(0.5).as_matrix(), atol=1e-12)
+
+
+def test_nothing_lies_between_two_frames():
+    utm = replace(pose(10, (5e6, 0, 0)), frame_id="utm")
+    assert at(buffer(pose(0), pose(5), utm), 5, 10).known.tolist() == [False, False]
+    poses = buffer(pose(0), utm, pose(20, (1, 0, 0)), pose(30, (2, 0, 0)))
+    np.testing.assert_allclose(at(poses, 25).map_from_vehicle[0, :3, 3], [1.5, 0, 0])
 
 
 def test_yaw_goes_the_short_way_round():

@@ -17,6 +17,7 @@ import pytest
 from pcgan.checkpoint import sha256
 from replay import OutputError, PredictorChoice, PredictorError, Replay, ReplaySettings, record
 from replay.log_reader import checksum
+from replay.roles import RoleChoices
 from replay.simulator.sensor_suite import CLUSTERS_TOPIC
 from schemas import codec, topics
 from schemas.messages import CameraDetections, LidarClusters, PredictionFrame, TrackFrame
@@ -51,7 +52,7 @@ def test_lineage_says_what_the_output_came_from(recorded, short_drive, model, mc
 
 
 def test_settings_in_the_output_can_be_used_again(short_drive, model, tmp_path, mcap_content):
-    settings = ReplaySettings(start_s=1.0, duration_s=1.5, topics={CLUSTERS_TOPIC: CLUSTERS_TOPIC})
+    settings = ReplaySettings(start_s=1.0, duration_s=1.5, roles=RoleChoices(clusters=CLUSTERS_TOPIC))
     record(run(short_drive, model, settings=settings), tmp_path / "out.mcap")
     attached = mcap_content(tmp_path / "out.mcap").attachments["settings.json"]
     assert ReplaySettings.model_validate_json(attached) == settings
@@ -264,6 +265,19 @@ def test_a_signal_ends_it_with_a_valid_output(short_drive, model, recorded, tmp_
     assert content.messages == mcap_content(recorded.path).messages[:40]
     assert json.loads(content.metadata["pcgan"]["complete"]) is False
     assert [path.name for path in tmp_path.iterdir()] == ["out.mcap"]
+
+
+def test_a_signal_ends_the_copy_of_the_recording_too(short_drive, model, tmp_path, mcap_content):
+    seen = []
+
+    def interrupt(frame):
+        seen.append(frame.log_time_ns)
+        if frame.tracks.sequence == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    record(run(short_drive, model), tmp_path / "out.mcap", merge=True, on_frame=interrupt)
+    recorded_ns = [at for topic, at, _ in mcap_content(tmp_path / "out.mcap").messages if "pcgan" not in topic]
+    assert recorded_ns == [at for _, at, _ in mcap_content(short_drive).messages if at <= seen[-1]]
 
 
 def test_an_error_of_the_callers_own_leaves_a_part(short_drive, model, tmp_path):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from replay import foxglove, recording_check
 from replay.camera_check import CameraCheck, CameraWatch, Estimate
-from replay.decoders import DECODERS
+from replay.decoders import PROTOBUF as DECODERS
 from replay.inspection import inspect_frames
 from replay.recording_check import ClockReset, RecordingReport, StampCheck, TopicTiming, check_stamps, report
 from replay.session import Replay, ReplaySettings
@@ -38,7 +38,7 @@ def check(path, **sync) -> RecordingReport:
     watch = CameraWatch(run.settings.tracking.fusion)
     for each in inspect_frames(run):
         watch.add(each.frame, each.measurements, each.labels, each.report.at_s)
-    return report(stamps(run), watch.checks(run.roles.topic_of))
+    return report(stamps(run), watch.checks(run.roles))
 
 
 def stamps(run: Replay) -> StampCheck:
@@ -289,7 +289,7 @@ def test_a_clock_that_was_set_is_a_verdict_and_the_only_one(short_drive, edit_lo
 # --- figures into words -----------------------------------------------------------------------------------------------
 
 
-def timing(topic: str, role: str = "camera detections", delay_ms: float = 50.0, **changes) -> TopicTiming:
+def timing(topic: str, role: str = "camera", delay_ms: float = 50.0, **changes) -> TopicTiming:
     usual = TopicTiming(topic, role, 300, 0, 30.0, 0.5, (delay_ms, delay_ms + 20), (5.0, 9.0), 1.0, 0, 0.03, 1.0)
     return replace(usual, **changes)
 
@@ -298,7 +298,7 @@ def verdicts(timings: list[TopicTiming], cameras: list[CameraCheck]) -> tuple[st
     return report(StampCheck(tuple(timings), ()), cameras).verdicts
 
 
-SCANS = timing(CLUSTERS_TOPIC, "lidar clusters", 80.0, scans_with=None)
+SCANS = timing(CLUSTERS_TOPIC, "clusters", 80.0, scans_with=None)
 
 
 def camera(name: str, **changes) -> CameraCheck:

@@ -2,11 +2,13 @@
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from replay import LogError, PredictorChoice, PredictorError, Replay, ReplaySettings, foxglove, replay
+from replay.roles import RoleChoices
 from replay.simulator.sensor_suite import CLUSTERS_TOPIC, ODOMETRY_TOPIC, TF_STATIC_TOPIC
 from schemas import codec
 from schemas import pcgan_v1_pb2 as pb
@@ -130,9 +132,23 @@ def test_a_split_recording_is_one_log(drive, model, edit_log, results, digest):
 
 def test_topics_under_other_names(short_drive, model, recorded, digest, edit_log):
     renamed = edit_log(short_drive, lambda log: log, topics={ODOMETRY_TOPIC: "/odom"})
-    with pytest.raises(LogError, match="the log has no vehicle pose"):
-        Replay([renamed])
-    assert digest(run(renamed, model, ReplaySettings(topics={ODOMETRY_TOPIC: "/odom"}))[0]) == digest(recorded.frames)
+    assert digest(run(renamed, model)[0]) == digest(recorded.frames)
+    assert digest(run(renamed, model, ReplaySettings(roles=RoleChoices(pose="/odom")))[0]) == digest(recorded.frames)
+    with pytest.raises(LogError, match="the log has no topic /odometry"):
+        Replay([renamed], ReplaySettings(roles=RoleChoices(pose="/odometry")))
+
+
+def test_without_odometry_the_transforms_say_where_the_vehicle_is(drive, model, edit_log, results):
+    no_odometry = edit_log(drive, lambda log: [m for m in log if m[0] != ODOMETRY_TOPIC])
+    frames, refusals = run(no_odometry, model)
+    assert refusals.total <= 2  # scans before the second transform
+    of_stamp = {frame.tracks.stamp_ns: frame for frame in results}
+    assert len(frames) >= len(results) - 2
+    for frame in frames:
+        before = of_stamp[frame.tracks.stamp_ns]
+        np.testing.assert_allclose(frame.sensors.map_from_vehicle, before.sensors.map_from_vehicle, atol=0.01)
+    same = [len(f.tracks.tracks) == len(of_stamp[f.tracks.stamp_ns].tracks.tracks) for f in frames]
+    assert np.mean(same) > 0.9
 
 
 # --- a part of a log -------------------------------------------------------------------------------------------------
@@ -305,13 +321,67 @@ def test_a_scan_that_comes_a_little_late_amends_the_tracks(drive, model, edit_lo
 
 def test_a_log_without_mounts_is_a_clear_error(short_drive, model, edit_log):
     no_mounts = edit_log(short_drive, lambda log: [m for m in log if m[0] != TF_STATIC_TOPIC])
-    with pytest.raises(LogError, match=r"no transform joins 'base_link' and 'velodyne_front_link'; the frames of"):
+    text = f"no transform joins 'base_link' and 'velodyne_front_link', the frame of {CLUSTERS_TOPIC}; the frames of"
+    with pytest.raises(LogError, match=text):
         run(no_mounts, model)
+
+
+def moved_to(topic, of, log):
+    """Logs the mounts of some frames on another topic, five times a second."""
+    for name, at_ns, data in log:
+        if name != TF_STATIC_TOPIC:
+            yield name, at_ns, data
+            continue
+        mounts = foxglove.decode("foxglove.FrameTransforms", data)
+        yield name, at_ns, foxglove.encode([mount for mount in mounts if of not in mount.child_frame_id])
+        moved = foxglove.encode([mount for mount in mounts if of in mount.child_frame_id])
+        for k in range(15):
+            yield topic, at_ns + k * 200_000_000, moved
+
+
+def test_mounts_are_looked_for_among_moving_transforms_if_a_camera_needs_them(short_drive, model, edit_log):
+    def move(log):
+        return sorted(moved_to("/tf", "gmsl", log), key=lambda message: message[1])
+
+    frames, refusals = run(edit_log(short_drive, move), model)
+    assert refusals.total == 0
+    assert [len(frame.sensors.cameras) for frame in frames] == [
+        len(frame.sensors.cameras) for frame in run(short_drive, model)[0]
+    ]
+
+
+def test_a_camera_that_no_transform_reaches_is_named_before_anything_starts(short_drive, edit_log):
+    path = edit_log(
+        short_drive, lambda log: moved_to("/elsewhere", "gmsl_left_link", log), schemas={"/elsewhere": "/tf"}
+    )
+    settings = ReplaySettings(roles=RoleChoices(transforms=("/tf", "/tf_static")))
+    text = "no transform joins 'base_link' and 'gmsl_left_link', the frame of /gmsl/A1/detections; the frames of"
+    with pytest.raises(LogError, match=text):
+        Replay([path], settings)
+
+
+def test_scans_in_a_frame_in_which_the_vehicle_moves_are_refused(short_drive, edit_log):
+    def in_odom(log):
+        for topic, at_ns, data in log:
+            scan = codec.decode(LidarClusters, data) if topic == CLUSTERS_TOPIC else None
+            yield topic, at_ns, data if scan is None else codec.encode(replace(scan, frame_id="odom"))
+
+    with pytest.raises(
+        LogError, match=f"{CLUSTERS_TOPIC} is in 'odom', in which the vehicle moves: LiDAR clusters must"
+    ):
+        Replay([edit_log(short_drive, in_odom)])
+
+
+def test_poses_of_which_none_can_be_read_are_a_clear_error(short_drive, edit_log):
+    no_poses = edit_log(short_drive, lambda log: [(t, at, b"?" if t == ODOMETRY_TOPIC else d) for t, at, d in log])
+    text = f"no message on {ODOMETRY_TOPIC} says where the vehicle is: .* refused: not a pcgan.v1.VehiclePose"
+    with pytest.raises(LogError, match=text):
+        Replay([no_poses])
 
 
 def test_what_a_log_lacks_is_said_before_anything_starts(short_drive, edit_log):
     no_lidar = edit_log(short_drive, lambda log: [m for m in log if m[0] != CLUSTERS_TOPIC])
-    with pytest.raises(LogError, match="the log has no lidar clusters: looked for /velodyne/front/clusters"):
+    with pytest.raises(LogError, match="no LiDAR clusters and no LiDAR points: looked for /velodyne/front/clusters"):
         Replay([no_lidar])
 
 
@@ -348,7 +418,7 @@ def test_a_replay_must_be_entered(short_drive):
 
 
 def test_settings_survive_json():
-    settings = ReplaySettings(start_s=2, duration_s=5, topics={ODOMETRY_TOPIC: "/odom"})
+    settings = ReplaySettings(start_s=2, duration_s=5, roles=RoleChoices(pose="/odom"))
     assert ReplaySettings.model_validate_json(settings.model_dump_json()) == settings
 
 

@@ -1,5 +1,7 @@
 """Unsynchronised messages in, one frame per scan out: when it is released, and what comes with it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,8 +10,9 @@ from pydantic import ValidationError
 
 from replay import PredictorChoice, Replay, ReplaySettings
 from replay.errors import LogError, Refusals
-from replay.roles import Roles, time_offsets
+from replay.roles import Reading, Roles, time_offsets
 from replay.time_sync import SyncSettings, TimeSync
+from schemas.messages import PointCloud, TrackFrame
 
 SCANS, POSES, BOXES = "/velodyne/front/clusters", "/vn100/odometry", "/gmsl/{}/detections"
 
@@ -206,7 +209,7 @@ def test_a_scan_without_a_pose_is_refused_and_counted(rig):
     r.poses(*range(900, 940, 10))
     r.scan(1000)
     assert list(r.sync.flush()) == []
-    assert r.refusals.as_json() == [{"topic": "lidar clusters", "reason": "no vehicle pose within 50 ms", "count": 1}]
+    assert r.refusals.as_json() == [{"topic": "scans", "reason": "no vehicle pose within 50 ms", "count": 1}]
 
 
 def test_a_scan_before_the_first_pose_is_refused_and_the_next_is_not(rig, make):
@@ -215,7 +218,7 @@ def test_a_scan_before_the_first_pose_is_refused_and_the_next_is_not(rig, make):
     r.scan(1000)
     r.poses(*range(960, 1400, 10))
     assert [f.sensors.stamp_ns for f in [*r.frames, *r.sync.flush()]] == [make.stamp(1000)]
-    assert r.refusals.counts["lidar clusters", "no vehicle pose within 50 ms"] == 1
+    assert r.refusals.counts["scans", "no vehicle pose within 50 ms"] == 1
 
 
 def test_a_pose_without_a_frame_is_of_base_link(rig):
@@ -453,19 +456,151 @@ def test_an_offset_that_makes_no_sense_is_refused(offset_ms):
     assert SyncSettings(time_offset_ms={SCANS: 10_000}).time_offset_ms == {SCANS: 10_000}
 
 
-def test_offsets_go_by_the_name_in_the_log_or_by_the_default_name():
-    truth = "/simulation/ground_truth"
-    roles = Roles({SCANS: "/clusters", POSES: POSES, truth: "/truth", "/tf_static": "/tf_static"}, (), ())
-    shifted = {"/clusters": -5_000_000, "/truth": -5_000_000}  # a ground truth belongs to its scan
-    assert time_offsets(roles, {"/clusters": -5}) == shifted
-    assert time_offsets(roles, {SCANS: -5}) == shifted
+def test_offsets_go_by_topic():
+    readings = {"/clusters": "clusters", POSES: "pose", "/truth": "truth", "/tf_static": "transforms"}
+    roles = Roles({topic: Reading(topic, role, None, "") for topic, role in readings.items()}, ())
+    assert time_offsets(roles, {"/clusters": -5}) == {"/clusters": -5_000_000, "/truth": -5_000_000}  # of its scan
     assert time_offsets(roles, {POSES: 0.25}) == {POSES: 250_000}
     assert time_offsets(roles, {}) == {}
-    for name in ("/nothing", "/tf_static", truth, "/truth"):
+    for name in ("/nothing", "/tf_static", "/truth"):
         with pytest.raises(LogError, match=f"{name} can have no time offset; topics with stamps that count are /clus"):
             time_offsets(roles, {name: 1})
-    with pytest.raises(LogError, match="/clusters has two time offsets"):
-        time_offsets(roles, {SCANS: 1, "/clusters": 2})
+
+
+# --- other sources ---------------------------------------------------------------------------------------------------
+
+
+def test_transforms_move_the_vehicle(make):
+    """The chain odom <- base_footprint <- base_link, of which one link moves; others' transforms are not poses."""
+    sync = TimeSync((), SyncSettings(), Refusals(), moving="/tf")
+    sync.take_static("/tf_static", None, make.transform("base_footprint", "base_link", (0, 0, 0.3)), Refusals())
+    sync.take_static("/tf_static", None, make.transform("base_link", "lidar", (1.2, 0, 1.4)), Refusals())
+    frames = []
+    for at_ms in range(900, 1200, 10):
+        moved = replace(make.transform("odom", "base_footprint", (2e-3 * at_ms, 1, 0)), stamp_ns=make.stamp(at_ms))
+        other = replace(make.transform("map", "odom", (50, 0, 0)), stamp_ns=make.stamp(at_ms + 500))
+        wheel = replace(make.transform("base_link", "wheel", (0, at_ms, 0)), stamp_ns=make.stamp(at_ms + 700))
+        for transform in (moved, other, wheel):
+            frames += sync.push("/tf", None, make.stamp(at_ms + 20), transform)
+        if at_ms == 1000:
+            frames += sync.push(SCANS, None, make.stamp(1025), make.scan(1000))
+    (frame,) = frames
+    assert (frame.sensors.frame_id, frame.sensors.vehicle_frame_id) == ("odom", "base_link")
+    np.testing.assert_allclose(frame.sensors.map_from_vehicle[:3, 3], [2, 1, 0.3], atol=1e-9)
+    np.testing.assert_allclose(frame.vehicle_state, [2, 1, 0, 2, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("stamp_ms", [500, None], ids=["ahead", "none"])
+def test_mounts_among_the_transforms_that_move_the_vehicle_are_no_poses(make, stamp_ms):
+    """As ROS 1 logs mounts: again and again, half a second ahead; others give them no stamp."""
+    refusals = Refusals()
+    sync, frames = TimeSync((), SyncSettings(), refusals, moving="/tf"), []
+    for at_ms in range(900, 1200, 10):
+        mounts = (make.transform("base_footprint", "base_link", (0, 0, 0.3)), make.transform("base_link", "lidar"))
+        stamp_ns = 0 if stamp_ms is None else make.stamp(at_ms + stamp_ms)
+        moved = replace(make.transform("odom", "base_footprint", (2e-3 * at_ms, 1, 0)), stamp_ns=make.stamp(at_ms))
+        for transform in (*(replace(mount, stamp_ns=stamp_ns) for mount in mounts), moved):
+            if at_ms == 900:
+                sync.take_static("/tf", None, transform, refusals)
+            else:
+                frames += sync.push("/tf", None, make.stamp(at_ms + 20), transform)
+        if at_ms == 1000:
+            frames += sync.push(SCANS, None, make.stamp(1025), make.scan(1000))
+    (frame,) = frames
+    np.testing.assert_allclose(frame.sensors.map_from_vehicle[:3, 3], [2, 1, 0.3], atol=1e-9)
+    assert (frame.epoch, refusals.total) == (0, 0)
+
+
+def test_the_moving_link_nearest_to_the_vehicle_says_when(make):
+    """map <- odom is corrected now and then, and stamped ahead; odom <- base_link is what drives."""
+    sync, frames = TimeSync((), SyncSettings(odometry_frame="map"), Refusals(), moving="/tf"), []
+    sync.take_static("/tf_static", None, make.transform("base_link", "lidar"), Refusals())
+    for at_ms in range(800, 1200, 10):
+        moved = replace(make.transform("odom", "base_link", (2e-3 * at_ms, 1, 0)), stamp_ns=make.stamp(at_ms))
+        drift_m = 50 + (at_ms > 850)
+        fixed = replace(make.transform("map", "odom", (drift_m, 0, 0)), stamp_ns=make.stamp(at_ms + 105))
+        for transform in (fixed, moved):
+            frames += sync.push("/tf", None, make.stamp(at_ms + 20), transform)
+        if at_ms == 1000:
+            frames += sync.push(SCANS, None, make.stamp(1025), make.scan(1000))
+    (frame,) = frames
+    np.testing.assert_allclose(frame.sensors.map_from_vehicle[:3, 3], [53, 1, 0], atol=1e-9)
+
+
+def test_a_root_frame_can_be_chosen(make):
+    sync = TimeSync((), SyncSettings(odometry_frame="map"), Refusals(), moving="/tf")
+    sync.take_static("/tf", None, make.transform("map", "odom", (50, 0, 0)), Refusals())
+    sync.take_static("/tf", None, make.transform("base_link", "lidar"), Refusals())
+    frames = []
+    for at_ms in (900, 1000, 1100):
+        moved = replace(make.transform("odom", "base_link", (1, 0, 0)), stamp_ns=make.stamp(at_ms))
+        frames += sync.push("/tf", None, make.stamp(at_ms), moved)
+        if at_ms == 1000:
+            frames += sync.push(SCANS, None, make.stamp(1025), make.scan(1000))
+    assert frames[0].sensors.frame_id == "map"
+    assert frames[0].sensors.map_from_vehicle[0, 3] == 51
+
+
+def test_points_become_clusters_on_the_way(make):
+    """A post in front of the sensor, and the ground under it."""
+    sync = TimeSync((), SyncSettings(), Refusals())
+    sync.take_static("/tf_static", None, make.transform("base_link", "lidar", (0, 0, 1.4)), Refusals())
+    grid = np.stack(np.meshgrid(np.arange(-15, 15, 0.3), np.arange(-15, 15, 0.3)), axis=-1).reshape(-1, 2)
+    ground = np.column_stack([grid, np.full(len(grid), -1.4)])
+    angle, height = np.meshgrid(np.linspace(0, 6, 40), np.linspace(-1.2, 0.3, 16))
+    post = np.column_stack([6 + 0.2 * np.cos(angle.ravel()), 0.2 * np.sin(angle.ravel()), height.ravel()])
+    frames = []
+    for at_ms in (900, 1000, 1100):
+        frames += sync.push(POSES, None, make.stamp(at_ms), make.pose(at_ms))
+        if at_ms == 1000:
+            cloud = PointCloud(make.stamp(1000), "lidar", np.concatenate([ground, post]))
+            frames += sync.push("/points", None, make.stamp(1010), cloud)
+    (frame,) = frames
+    np.testing.assert_allclose(frame.sensors.clusters.centroids_m[:, :2], [[6, 0]], atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("frame", "x"),
+    [("odom", 3.0), ("lidar", 3.0 + 2.0 + 1.2), ("map", 13.0)],
+    ids=["pose's", "on the vehicle", "joined"],
+)
+def test_tracks_come_in_any_frame_that_is_joined_to_the_pose(make, frame, x):
+    sync = TimeSync((), SyncSettings(), Refusals())
+    sync.take_static("/tf_static", None, make.transform("base_link", "lidar", (1.2, 0, 1.4)), Refusals())
+    sync.take_static("/tf", None, make.transform("odom", "map", (10, 0, 0)), Refusals())
+    tracks, frames = TrackFrame(0, make.stamp(1000), frame), []
+    for at_ms in (900, 1000, 1100):
+        frames += sync.push(POSES, None, make.stamp(at_ms), make.pose(at_ms))
+        if at_ms == 1000:
+            frames += sync.push("/tracks", None, make.stamp(1010), tracks)
+    (found,) = frames
+    assert found.objects is tracks
+    assert (found.sensors.map_from_lidar @ [3, 0, 0, 1])[0] == pytest.approx(x)
+    assert len(found.sensors.clusters.points) == 0
+
+
+def test_tracks_may_hang_from_the_vehicle_by_another_of_its_frames(make):
+    """The pose is the IMU's, the tracks are in base_link, which has the IMU on it; transforms also say where it is."""
+    sync, frames = TimeSync((), SyncSettings(), Refusals()), []
+    sync.take_static("/tf_static", None, make.transform("base_link", "imu", (0.5, 0, 0.3)), Refusals())
+    for at_ms in range(900, 1200, 10):
+        moved = make.transform("odom", "base_link", (2e-3 * at_ms - 0.5, 0, -0.3))
+        frames += sync.push("/tf", None, make.stamp(at_ms), moved)
+        frames += sync.push(POSES, None, make.stamp(at_ms), make.pose(at_ms, child="imu"))
+        if at_ms == 1000:
+            frames += sync.push("/tracks", None, make.stamp(1010), TrackFrame(0, make.stamp(1000), "base_link"))
+    (found,) = frames
+    np.testing.assert_allclose(found.sensors.map_from_lidar[:3, 3], [1.5, 0, -0.3], atol=1e-9)
+
+
+def test_waiting_scans_are_released_when_time_passes_without_a_message(rig, make):
+    r = rig()
+    r.poses(*range(900, 1020, 10))
+    r.scan(1000)
+    assert list(r.sync.advance(make.stamp(1319))) == []
+    (frame,) = r.sync.advance(make.stamp(1320))
+    assert frame.sensors.stamp_ns == make.stamp(1000)
+    assert frame.log_time_ns == make.stamp(1320)
 
 
 @pytest.mark.parametrize("late", [("/gmsl/A1/detections",), (SCANS, "/simulation/ground_truth")], ids=["A1", "LiDAR"])

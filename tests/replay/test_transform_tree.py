@@ -85,3 +85,21 @@ def test_a_circle_ends(target):
     made = tree(transform("a", "b"), transform("b", "c"), transform("c", "a"))
     found = made.transform(target, "b")
     assert found is None if target == "elsewhere" else found.shape == (4, 4)
+
+
+def test_a_frame_moves_once_its_transform_has_changed():
+    made = tree(transform("odom", "base"), transform("base", "lidar", (1, 0, 0)), transform("odom", "base", (0, 1, 0)))
+    made.add(transform("base", "lidar", (1, 0, 0)))  # again, as it was
+    assert [made.moves(frame) for frame in ("odom", "base", "lidar")] == [False, True, False]
+    made.add(transform("mast", "lidar", (1, 0, 0)))
+    assert made.moves("lidar")
+
+
+def test_what_hangs_from_the_vehicle_or_is_joined_to_it_by_mounts_alone_is_fixed_to_it():
+    links = [transform("map", "odom"), transform("odom", "base"), transform("base", "imu"), transform("base", "lidar")]
+    made = tree(*links, transform("odom", "base", (1, 0, 0)))
+    assert [made.is_fixed(frame, "imu") for frame in ("imu", "base", "lidar")] == [True] * 3
+    assert [made.is_fixed(frame, "imu") for frame in ("odom", "map", "nobody's")] == [False] * 3
+    made.add(transform("base", "lidar", (0, 0, 1)))  # a mast that goes up
+    assert made.is_fixed("lidar", "base")
+    assert not made.is_fixed("lidar", "imu")

@@ -321,6 +321,7 @@ REFUSED = {
     "a NaN truth": (GroundTruthFrame, truth(x=[NAN]), r"GroundTruthFrame\.x holds NaN or infinity"),
     "tracks without a stamp": (TrackFrame, track_frame(stamp_ns=0), "TrackFrame has no stamp"),
     "two tracks of one id": (TrackFrame, track_frame(track(), track()), "TrackFrame has two tracks of one id"),
+    "an id beyond 63 bits": (TrackFrame, track_frame(track(id=2**63)), "a track of the id 9223372036854775808"),
     "a NaN track": (TrackFrame, track_frame(track(vx=NAN)), r"Track\.vx holds NaN"),
     "existence above 1": (TrackFrame, track_frame(track(existence=1.1)), r"existence \[?1\.1\]? is outside 0 to 1"),
     "existence below 0": (TrackFrame, track_frame(track(existence=-1)), "is outside 0 to 1"),
