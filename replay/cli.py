@@ -31,6 +31,7 @@ from replay.cli_common import (
     console,
     errors,
     fail,
+    note_missing,
     progress,
     refuse_unwritable,
     settings_of,
@@ -151,6 +152,7 @@ def replay(
 
     **Exit codes**: 0 all well, 2 an error, 3 messages were refused or lost, 130 Ctrl-C, 143 SIGTERM.
     """
+    from pcgan.bus import DEFAULT_ENDPOINT
     from replay.log_writer import DEFAULT_FORMATS
     from replay.picture import BusiestMoment, draw_top_down
     from replay.rerun_view import NullView, RerunView
@@ -163,7 +165,7 @@ def replay(
     if predictor is PredictorMode.external and (model is not None or horizon is not None):
         fail(f"{'--model' if model is not None else '--horizon'}: an external predictor has its own weights")
     if predictor is PredictorMode.external and not (connect or zenoh_config):
-        connect = "tcp/127.0.0.1:7447"
+        connect = DEFAULT_ENDPOINT
     if merge and salvage:
         fail("--merge copies intact recordings only: it cannot go with --salvage")
     if rrd and view:
@@ -181,10 +183,17 @@ def replay(
         pedestrian_labels=pedestrian_label,
     )
     choice = PredictorChoice(predictor.value, _chosen(model, horizon), connect, zenoh_config, namespace)
-    images = rrd is not None or view
-    run = Replay(logs, settings, choice, window=window, rate=rate, strict=strict, salvage=salvage, images=images)
-    for name in run.roles.missing:
-        errors.print(f"note: the log has no {name}", markup=False)
+    run = Replay(
+        logs,
+        settings,
+        choice,
+        window=window,
+        rate=rate,
+        strict=strict,
+        salvage=salvage,
+        images=rrd is not None or view,
+    )
+    note_missing(run)
     if predictor is PredictorMode.external:
         errors.print(f"looking for a predictor on {connect or zenoh_config}", markup=False)
     recording_id = "+".join(path.stem for path in logs)

@@ -116,6 +116,12 @@ def refused_figures(run: Replay) -> dict[str, object]:
     return {"refused": refused.total, "refusals": refused.as_json(), "salvage_losses": run.reader.losses.notes}
 
 
+def note_missing(run: Replay) -> None:
+    """Says what would make the result better and is not in the log."""
+    for name in run.roles.missing:
+        errors.print(f"note: the log has no {name}", markup=False)
+
+
 def closing_lines(run: Replay, written: Sequence[Path], out: Console) -> int:
     """Says what was refused, lost and written; returns the exit code."""
     refused, losses = run.refusals, run.reader.losses.notes

@@ -21,8 +21,8 @@ from replay.cli_common import (
     closing_lines,
     console,
     ended_by_signals,
-    errors,
     fail,
+    note_missing,
     progress,
     refuse_unwritable,
     refused_figures,
@@ -102,8 +102,7 @@ def inspect(
             fail(f"--at {at:g} lies before the start, {settings.start_s:g} s into the log")
         settings = settings.model_copy(update={"duration_s": at - settings.start_s + AFTER_S})
     run = Replay(logs, settings, salvage=salvage, images=rrd is not None)
-    for name in run.roles.missing:
-        errors.print(f"note: the log has no {name}", markup=False)
+    note_missing(run)
     whole = not frames and at is None
     out, params = console(minimum_width=100), run.settings.tracking.fusion
     watch, log, kept = CameraWatch(params), InspectionLog(), list[Any]()

@@ -22,8 +22,8 @@ from replay.cli_common import (
     closing_lines,
     console,
     ended_by_signals,
-    errors,
     fail,
+    note_missing,
     progress,
     refuse_unwritable,
     refused_figures,
@@ -100,8 +100,7 @@ def label(
     )
     wanted = LabelSettings(min_duration_s=min_duration, min_hits=min_hits, max_gap_s=max_gap)
     run = Replay(logs, settings, strict=strict, salvage=salvage)
-    for name in run.roles.missing:
-        errors.print(f"note: the log has no {name}", markup=False)
+    note_missing(run)
     with ended_by_signals(), progress() as bar:
         task = bar.add_task("labelling", total=(run.end_ns - run.start_ns) / 1e9)
 

@@ -25,8 +25,8 @@ from replay.cli_common import (
     closing_lines,
     console,
     ended_by_signals,
-    errors,
     fail,
+    note_missing,
     progress,
     refuse_unwritable,
     refused_figures,
@@ -129,8 +129,7 @@ def whatif(
         fail(f"--at {at:g} lies before the start, {settings.start_s:g} s into the log")
     settings = settings.model_copy(update={"duration_s": at - settings.start_s + NEAREST_S})
     run = Replay(logs, settings, PredictorChoice("inline", model), salvage=salvage)
-    for name in run.roles.missing:
-        errors.print(f"note: the log has no {name}", markup=False)
+    note_missing(run)
     with ended_by_signals(), what_if_view(rrd, view, "+".join(log.stem for log in logs)) as shown, run:
         with progress() as bar:
             bar.add_task("replaying", total=None)

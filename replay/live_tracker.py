@@ -12,9 +12,9 @@ from replay.class_labels import ClassLabels, unmatched_line
 from replay.errors import LogError, Refusals
 from replay.frame_result import vehicle_pose
 from replay.logged_message import RawMessage
-from replay.pipeline import FrameStage, FrameTracker, TrackFollower, amend
+from replay.pipeline import amend
 from replay.roles import WHAT, Roles, decoded, live_roles
-from replay.session import ReplaySettings
+from replay.session import ReplaySettings, frame_stage
 from replay.time_sync import SyncedFrame, TimeSync
 from schemas.codec import CodecError
 from schemas.messages import TrackFrame, VehiclePose
@@ -51,11 +51,7 @@ class LiveTracker:
         self.roles = roles or live_roles(settings.roles)
         self._refusals = _LiveRefusals(on_refused)
         self._sync = TimeSync.of(self.roles, settings.sync, settings.segmentation, self._refusals)
-        self._stage: FrameStage
-        if self.roles.readings[self.roles.scans].role == "tracks":
-            self._stage = TrackFollower(settings.object_tracks, settings.tracking.fusion.pedestrian_labels)
-        else:
-            self._stage = FrameTracker(settings.tracking)
+        self._stage = frame_stage(self.roles, settings)
         self._waiting: deque[SyncedFrame] = deque()
         self._started_ns = 0  # arrival of the first message
         self._heard_ns: dict[str, int] = {}  # topic -> arrival of its last message that was of use

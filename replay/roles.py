@@ -133,6 +133,11 @@ class Roles:
         return self.topics(*SCANS)[0]
 
     @property
+    def scan_role(self) -> str:
+        """What those messages are: one of SCANS."""
+        return self.readings[self.scans].role
+
+    @property
     def pose(self) -> str:
         """The topic that says where the vehicle is."""
         return self.topics("pose")[0]
@@ -227,7 +232,7 @@ def time_offsets(roles: Roles, offsets_ms: Mapping[str, float]) -> dict[str, int
     may_have = roles.topics(*STAMPED)
     if unknown := sorted(set(offsets_ms) - set(may_have)):
         raise LogError(
-            f"{unknown[0]} can have no time offset; topics with stamps that count are {_listed(sorted(may_have))}"
+            f"{unknown[0]} can have no time offset; topics with stamps that count are {listed(sorted(may_have))}"
         )
     offsets_ns = {topic: round(offset_ms * 1e6) for topic, offset_ms in offsets_ms.items()}
     if roles.scans in offsets_ns:
@@ -262,7 +267,7 @@ class _Found:
         """Returns a topic in the role the user gave it; raises LogError if it cannot play it."""
         channel = self.channels.get(topic)
         if channel is None:
-            raise LogError(f"the log has no topic {topic}; its topics are {_listed(sorted(self.channels))}")
+            raise LogError(f"the log has no topic {topic}; its topics are {listed(sorted(self.channels))}")
         self._check(role, channel)
         return Reading(topic, role, camera, "chosen")
 
@@ -285,7 +290,7 @@ class _Found:
                 return Reading(topic.name, role, None, "the default name")
         if len(fit) > 1:
             raise LogError(
-                f"{len(fit)} topics could be the {WHAT[role]}: {_listed(fit)}; choose one with --role {role}:=TOPIC"
+                f"{len(fit)} topics could be the {WHAT[role]}: {listed(fit)}; choose one with --role {role}:=TOPIC"
             )
         if not fit:
             return None
@@ -307,7 +312,7 @@ def _scan(found: _Found, choices: RoleChoices) -> Reading:
     raise LogError(
         f"the log has no {WHAT['clusters']} and no {WHAT['points']}: looked for {default} and for any topic of "
         f"{' or '.join(schemas_for('clusters') + schemas_for('points'))}; "
-        f"its topics are {_listed(sorted(found.channels))}{hint}"
+        f"its topics are {listed(sorted(found.channels))}{hint}"
     )
 
 
@@ -322,7 +327,7 @@ def _pose(found: _Found, choices: RoleChoices) -> Reading:
         default = next(topic.name for topic in topics.INPUTS if topic.role == "pose")
         raise LogError(
             f"the log has no {WHAT['pose']}: looked for {default} and for any topic of "
-            f"{' or '.join(schemas_for('pose'))}; its topics are {_listed(sorted(found.channels))}; "
+            f"{' or '.join(schemas_for('pose'))}; its topics are {listed(sorted(found.channels))}; "
             "use --role pose:=TOPIC"
         )
     if reading.why != "chosen" and not poses:
@@ -364,7 +369,7 @@ def _cameras(found: _Found, choices: RoleChoices, frame_of: FrameOf) -> list[Rea
         if calibration is None:
             raise LogError(
                 f"camera {name} has detections ({camera.detections}) but no calibration: looked for one beside it or "
-                f"of its frame; its topics are {_listed(sorted(found.channels))}; "
+                f"of its frame; its topics are {listed(sorted(found.channels))}; "
                 f"use --role camera.{name}:={camera.detections} --role calibration.{name}:=TOPIC, choose other cameras "
                 "likewise, or none with an empty [roles.cameras] in a profile"
             )
@@ -426,5 +431,6 @@ def schemas_for(role: str) -> list[str]:
     return sorted({name for message in MESSAGES[role] for name in schemas_of(message)})
 
 
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names) if names else "none"
+def listed(names: Sequence[str]) -> str:
+    """Returns names in a row, for people; "none" without any."""
+    return ", ".join(names) or "none"

@@ -20,9 +20,19 @@ from replay.log_reader import LogReader
 from replay.logged_message import RawMessage
 from replay.object_tracks import ObjectTracksParams
 from replay.pacing import Pacer
-from replay.pipeline import FrameTracker, TrackFollower, run_pipeline
+from replay.pipeline import FrameStage, FrameTracker, TrackFollower, run_pipeline
 from replay.remote_predictor import AskedPredictor, InlinePredictor, RemotePredictor
-from replay.roles import WHAT, Reading, RoleChoices, assign_roles, decoded, static_only, time_offsets
+from replay.roles import (
+    WHAT,
+    Reading,
+    RoleChoices,
+    Roles,
+    assign_roles,
+    decoded,
+    listed,
+    static_only,
+    time_offsets,
+)
 from replay.stage_clock import StageClock
 from replay.time_sync import SyncedFrame, SyncSettings, TimeSync
 from replay.transform_tree import TransformTree
@@ -132,7 +142,7 @@ class Replay:
                 tree.add(transform)
             if len(tree.ancestors(vehicle)) < 2:
                 raise LogError(
-                    f"no transform on {roles.pose} moves {vehicle!r}; its frames are {_listed(tree.frames)}; "
+                    f"no transform on {roles.pose} moves {vehicle!r}; its frames are {listed(tree.frames)}; "
                     "set sync.vehicle_frame, or choose another topic with --role pose:=TOPIC"
                 )
         else:
@@ -154,12 +164,12 @@ class Replay:
             if tree.transform(vehicle, frame) is None:
                 raise LogError(
                     f"no transform joins {vehicle!r} and {frame!r}, the frame of {topic}; the frames of "
-                    f"{' and '.join(every) or 'the transforms'} are {_listed(tree.frames)}"
+                    f"{' and '.join(every) or 'the transforms'} are {listed(tree.frames)}"
                     + ("" if named else "; set sync.vehicle_frame if the vehicle's frame is another one")
                 )
         if scan.frame_id in tree.ancestors(vehicle) and not tree.is_fixed(scan.frame_id, vehicle):
             raise LogError(
-                f"{roles.scans} is in {scan.frame_id!r}, in which the vehicle moves: {WHAT[self._scan_role]} must be "
+                f"{roles.scans} is in {scan.frame_id!r}, in which the vehicle moves: {WHAT[roles.scan_role]} must be "
                 "in a frame that is fixed to the vehicle; another tracker's tracks go with --tracks TOPIC"
             )
         return mounts
@@ -218,7 +228,7 @@ class Replay:
         """Yields frame results in stamp order."""
         return run_pipeline(
             self._paced(self.frames()),
-            self._follower() if self._follows else self.tracker(),
+            frame_stage(self.roles, self.settings),
             self.predictor,
             window=self._window,
             published=lambda frame: frame.log_time_ns >= self.start_ns,
@@ -228,21 +238,9 @@ class Replay:
 
     def tracker(self) -> FrameTracker:
         """Returns our tracker, as it is before the first frame; raises LogError if another's tracks are to be used."""
-        if self._follows:
+        if self.roles.scan_role == "tracks":
             raise LogError(f"{self.roles.scans} holds another tracker's tracks: there is nothing to track in it")
         return FrameTracker(self.settings.tracking)
-
-    def _follower(self) -> TrackFollower:
-        settings = self.settings
-        return TrackFollower(settings.object_tracks, settings.tracking.fusion.pedestrian_labels)
-
-    @property
-    def _follows(self) -> bool:
-        return self._scan_role == "tracks"
-
-    @property
-    def _scan_role(self) -> str:
-        return self.roles.readings[self.roles.scans].role
 
     def frames(self) -> Iterator[SyncedFrame]:
         """Yields synchronised frames from 4 s before the start on."""
@@ -300,6 +298,13 @@ class Replay:
         return messages
 
 
+def frame_stage(roles: Roles, settings: ReplaySettings) -> FrameStage:
+    """Returns what makes tracks of frames, in a replay as live: our tracker, or what follows another one's tracks."""
+    if roles.scan_role == "tracks":
+        return TrackFollower(settings.object_tracks, settings.tracking.fusion.pedestrian_labels)
+    return FrameTracker(settings.tracking)
+
+
 def frame_named(reader: LogReader, topic: str) -> str | None:
     """Returns the frame that a topic's first readable message names."""
     for message in reader.messages({topic}):
@@ -307,10 +312,6 @@ def frame_named(reader: LogReader, topic: str) -> str | None:
             with contextlib.suppress(CodecError):
                 return getattr(way.decode(message.data), "frame_id", None)
     return None
-
-
-def _listed(frames: Sequence[str]) -> str:
-    return ", ".join(frames) or "none"
 
 
 def replay(
