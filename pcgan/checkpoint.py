@@ -28,6 +28,7 @@ WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 TABLE_WEIGHTS = WEIGHTS_FOLDER / "tables"
 DEFAULT_CHECKPOINT = WEIGHTS_FOLDER / "vehicle_2.5hz.safetensors"
 MAX_BYTES = 64 << 20  # a generator has 0.1 MB; what is far larger is something else
+MAX_SIZE = 10_000  # of anything that a configuration counts; a layer has some hundreds
 
 
 class CheckpointError(ValueError):
@@ -166,8 +167,8 @@ def _header(path: Path, metadata: Mapping[str, str] | None) -> dict[str, Any]:
     try:
         header: dict[str, Any] = json.loads(metadata["pcgan"])
         version = header["format"]
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise CheckpointError(f"{path} has a header that cannot be read: {error!r}") from error
+    except (ValueError, KeyError, TypeError, RecursionError) as error:  # ValueError: no JSON, or thousands of digits
+        raise CheckpointError(f"{path} has a header that cannot be read: {error!r:.200}") from error
     if version != FORMAT_VERSION:
         raise CheckpointError(f"{path} is of checkpoint format {version}; this version reads {FORMAT_VERSION}")
     return header
@@ -179,6 +180,9 @@ def _description(path: Path, header: Mapping[str, Any]) -> Description:
         if network not in _KINDS:
             raise ValueError(f"network {network!r} is of no known kind; there are {', '.join(_KINDS)}")
         config = _KINDS[network].from_dict(header["config"])
+        for name, value in asdict(config).items():
+            if isinstance(value, int | float) and abs(value) > MAX_SIZE:
+                raise ValueError(f"{name} is {value!s:.20}, more than any network has ({MAX_SIZE})")
         return Description(str(header["name"]), network, config, dict(header["training"]))
     except KeyError as error:
         raise CheckpointError(f"{path} has no {error} in its header") from error
@@ -208,8 +212,8 @@ def load_network(path: Path) -> tuple[Network, Checkpoint]:
     one is not finite.
     """
     checkpoint = load(path)
-    network = build(checkpoint.config)
-    wanted = network.state_dict()
+    with torch.device("meta"):  # takes no memory: the header may claim any size
+        wanted = build(checkpoint.config).state_dict()
     if differing := sorted(wanted.keys() ^ checkpoint.tensors.keys()):
         raise CheckpointError(f"{path} and its configuration differ in the weights {differing}")
     for name, tensor in checkpoint.tensors.items():
@@ -218,6 +222,7 @@ def load_network(path: Path) -> tuple[Network, Checkpoint]:
             raise CheckpointError(f"{path}: weight {name} is {found}, its configuration needs {needed}")
         if not torch.isfinite(tensor).all():
             raise CheckpointError(f"{path}: weight {name} holds NaN or infinity")
+    network = build(checkpoint.config)
     network.load_state_dict(checkpoint.tensors)
     return network.eval(), checkpoint
 

@@ -12,7 +12,20 @@ from typing import Annotated
 import typer
 
 from pcgan.node_health import DEFAULT_DEADLINE_MS
-from replay import cli_data, cli_export, cli_inspect, cli_label, cli_models, cli_play, cli_track, cli_whatif
+from replay import (
+    cli_batch,
+    cli_check,
+    cli_data,
+    cli_diff,
+    cli_export,
+    cli_inspect,
+    cli_label,
+    cli_models,
+    cli_play,
+    cli_report,
+    cli_track,
+    cli_whatif,
+)
 from replay.cli_common import (
     DRIVES,
     EXIT_ERROR,
@@ -64,6 +77,23 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(version("pcgan"))
+        raise typer.Exit
+
+
+@app.callback()
+def _about(
+    version: Annotated[
+        bool, typer.Option("--version", metavar="", callback=_print_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    pass
 
 
 class PredictorMode(StrEnum):
@@ -150,7 +180,8 @@ def replay(
 
     pcgan replay drive.mcap --predictor external --connect tcp/127.0.0.1:7447
 
-    **Exit codes**: 0 all well, 2 an error, 3 messages were refused or lost, 130 Ctrl-C, 143 SIGTERM.
+    **Exit codes**: 0 all well, 2 an error, 3 messages were refused or lost, 130 Ctrl-C, 143 SIGTERM,
+    129 a closed terminal.
     """
     from pcgan.bus import DEFAULT_ENDPOINT
     from replay.log_writer import DEFAULT_FORMATS
@@ -291,7 +322,7 @@ def predict(
     namespace: Namespace = "",
     ros2_domain: Ros2Domain = None,
     deadline_ms: Deadline = DEFAULT_DEADLINE_MS,
-    spawned: Annotated[bool, typer.Option("--spawned", hidden=True)] = False,
+    spawned: Annotated[Path | None, typer.Option("--spawned", hidden=True)] = None,  # in whose folder
 ) -> None:
     """Serve predictions over zenoh until Ctrl-C: pcgan/tracks in, pcgan/predictions out, queries on pcgan/predict.
 
@@ -308,7 +339,10 @@ def predict(
     from pcgan import bus
 
     with ExitStack() as ends:
-        if spawned:
+        if spawned is not None:
+            from replay.private_folder import remove_if_abandoned
+
+            ends.callback(remove_if_abandoned, spawned)
             session = ends.enter_context(bus.open_session(connect=[connect] if connect else []))
         else:  # before the weights are loaded, which takes a while: who is started first listens
             session = ends.enter_context(live_session(listen, connect, zenoh_config, ros2_domain))
@@ -321,7 +355,7 @@ def predict(
         except CheckpointError as error:
             fail(str(error))
         identity = bus.ModelIdentity(predictor.model_name, predictor.checksum)
-        if not spawned:
+        if spawned is None:
             warn_of_others(session, bus.any_alive_key(namespace), "a predictor", "every frame is answered twice")
             where = place(listen, connect, zenoh_config, ros2_domain)
             errors.print(f"serving {identity.name} on {where}; Ctrl-C ends it", markup=False)
@@ -339,11 +373,11 @@ def predict(
             identity,
             namespace=namespace,
             deadline_ms=deadline_ms,
-            end_with_stdin=spawned,
+            end_with_stdin=spawned is not None,
             on_answer=on_answer,
             on_health=lambda health: say(health_line(health)),
         )
-    if refused and not spawned:
+    if refused and spawned is None:
         errors.print(f"{refused} malformed messages were refused", markup=False)
         raise typer.Exit(EXIT_REFUSED)
 
@@ -384,6 +418,10 @@ app.add_typer(cli_track.app)
 app.add_typer(cli_label.app)
 app.add_typer(cli_export.app)
 app.add_typer(cli_whatif.app)
+app.add_typer(cli_diff.app)
+app.add_typer(cli_check.app)
+app.add_typer(cli_report.app)
+app.add_typer(cli_batch.app)
 app.add_typer(cli_play.app)
 app.add_typer(cli_models.app)
 app.add_typer(cli_data.app, rich_help_panel="Data")

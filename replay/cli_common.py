@@ -1,14 +1,12 @@
 """What every command shares: options, one-line errors, exit codes, consoles, the progress bar, files on the side."""
 
 import json
-import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
-from pydantic import ValidationError
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -16,15 +14,17 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from replay.class_labels import unmatched_line
 from replay.errors import refused_line
 from replay.interrupts import Interrupted, Interrupts
+from replay.part_file import write_whole
 from replay.roles import SCANS
 from replay.session import Replay, ReplaySettings
+from replay.settings_file import read_profile
 from replay.time_sync import SyncSettings
 
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 EXIT_ERROR = 2  # a mistake that the user can mend: one line says which
 EXIT_REFUSED = 3  # the run went through, but messages were refused or a damaged file lost some
-DRIVES, LIVE = "Drives", "Live"  # panels of the help
+DRIVES, REGRESSION, LIVE = "Drives", "Regression", "Live"  # panels of the help
 
 # options that several commands have
 Log = Annotated[list[Path], typer.Argument(metavar="LOG.mcap", help="The recording, in one file or several.")]
@@ -61,7 +61,7 @@ TimeOffsets = Annotated[
 ProfileFile = Annotated[
     Path | None,
     typer.Option(
-        "--profile", metavar="FILE", help="Roles and settings as TOML or JSON, e.g. an output's settings.json."
+        "--profile", metavar="FILE", help="Roles and settings in YAML, TOML or JSON, e.g. an output's settings.json."
     ),
 ]
 
@@ -103,11 +103,8 @@ def refuse_unwritable(*paths: Path | None) -> None:
 
 
 def write_json(path: Path, value: object, *, indent: int | None = 2) -> None:
-    """Writes a value as JSON, or ends the command."""
-    try:
-        path.write_text(json.dumps(value, indent=indent) + "\n")
-    except OSError as error:
-        fail(f"{path} cannot be written: {error.strerror or error}")
+    """Writes a value as JSON: a whole file or, with an OutputError, none."""
+    write_whole(path, (json.dumps(value, indent=indent) + "\n").encode())
 
 
 def refused_figures(run: Replay) -> dict[str, object]:
@@ -190,22 +187,3 @@ def _with_time_offsets(settings: ReplaySettings, options: list[str] | None) -> R
             )
         settings = settings.model_copy(update={"sync": sync})
     return settings
-
-
-def read_profile(path: Path | None) -> ReplaySettings:
-    """Reads roles and settings from a TOML or JSON file; what it leaves out keeps its default."""
-    if path is None:
-        return ReplaySettings()
-    try:
-        text = path.read_text()
-        plain = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-        return ReplaySettings.model_validate_json(json.dumps(plain, default=str))
-    except OSError as error:
-        fail(f"{path} cannot be read: {error.strerror or error}")
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the file"
-        fail(f"{path} is no profile: {where}: {first['msg']}")
-    except ValueError as error:  # of both parsers
-        kind = "JSON" if path.suffix == ".json" else "TOML"
-        fail(f"{path} is not {kind}: {error}")

@@ -2,9 +2,21 @@
 
 from collections import Counter
 
+LONGEST_LINE = 1500  # characters
+
+
+def one_line(text: str) -> str:
+    """Returns a text as a terminal can show it in one line: a recording's names may hold anything, and be endless."""
+    if not text.isprintable():
+        text = "".join(c if c.isprintable() else c.encode("unicode_escape", "backslashreplace").decode() for c in text)
+    return text if len(text) <= LONGEST_LINE else f"{text[: LONGEST_LINE // 2]} ... {text[-LONGEST_LINE // 2 :]}"
+
 
 class ReplayError(Exception):
     """Anything a user can mend: shown as one line, exit code 2."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class LogError(ReplayError):
@@ -22,10 +34,12 @@ class PredictorError(ReplayError):
 class Refusals:
     """Messages that were refused, counted by topic and reason; the run goes on unless `strict`.
 
-    Keeps the first few in words, so that a summary can show them without growing with the log.
+    Keeps the first few in words, and a limited number of different reasons (they quote values), so that a summary can
+    show them without growing with the log.
     """
 
     KEPT = 20
+    REASONS = 1000
 
     def __init__(self, *, strict: bool = False):
         self._strict = strict
@@ -34,9 +48,11 @@ class Refusals:
 
     def add(self, topic: str, stamp_ns: int, kind: str, detail: str = "") -> None:
         """Counts one refused message; raises LogError at once if strict."""
-        line = f"{topic} at {stamp_ns / 1e9:.3f} s refused: {kind}{f' ({detail})' if detail else ''}"
+        line = one_line(f"{topic} at {stamp_ns / 1e9:.3f} s refused: {kind}{f' ({detail})' if detail else ''}")
         if self._strict:
             raise LogError(f"{line}; without --strict the run would go on")
+        if len(self.counts) >= self.REASONS and (topic, kind) not in self.counts:
+            kind = "other reasons"
         self.counts[topic, kind] += 1
         if len(self.first) < self.KEPT:
             self.first.append(line)

@@ -3,50 +3,46 @@
 Memory is bounded by the chunks that overlap in time, whatever the length of the log. Files are opened for reading only.
 """
 
-import contextlib
-import errno
 import hashlib
 import heapq
-import io
-import mmap
+import os
 import struct
 import threading
 import zlib
-from bisect import bisect_left
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import zip_longest
-from operator import attrgetter
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import IO, cast
+from typing import IO, NamedTuple, Self
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
-from mcap.reader import NonSeekingReader, SeekingReader
-from mcap.records import Channel, Chunk, McapRecord, Message, Schema, Statistics
-from mcap.stream_reader import MAGIC_SIZE, breakup_chunk, get_chunk_data_stream
+from mcap.records import Channel, ChunkIndex, DataEnd, Schema, Statistics
+from mcap.summary import Summary
 
 from replay.errors import LogError
-from replay.logged_message import NO_SCHEMA, ChannelInfo, LoggedSchema, RawMessage
-
-# Files without an index, and damaged ones, come in file order: writers interleave sensors by less than this.
-REORDER_NS = 2_000_000_000
-
-
-@dataclass
-class Losses:
-    """What `--salvage` could not read."""
-
-    chunks: int = 0
-    notes: list[str] = field(default_factory=list)
+from replay.file_bytes import FileBytes
+from replay.log_salvage import Losses, SalvagedFile
+from replay.logged_message import ChannelInfo, LoggedSchema, RawMessage
+from replay.mcap_records import (
+    MAGIC,
+    MESSAGE,
+    RECORD,
+    DamageError,
+    chunk_content,
+    chunk_head,
+    crc_of,
+    declared,
+    parsed,
+    record_at,
+    records_in,
+)
+from replay.message_order import in_time_order, log_time, reordered
 
 
 class LogReader:
     """Several MCAP files (a split recording, a drive and its sidecar) read as one log.
 
-    Raises LogError naming file and problem if a file is no MCAP, is cut short, or has no summary, unless `salvage`.
+    Raises LogError naming file and problem if a file is no MCAP, is cut short, or has no summary, unless `salvage`. Its
+    messages raise it if they have been read to the end, and the file has been changed meanwhile.
     """
 
     def __init__(self, paths: Sequence[Path], *, salvage: bool = False):
@@ -54,6 +50,8 @@ class LogReader:
             raise LogError("no recording given")
         self.paths = tuple(paths)
         self.losses = Losses()
+        self._salvage = salvage
+        self._opened = [_identity(path) for path in self.paths]
         self._files = [_open(path, self.losses if salvage else None) for path in self.paths]
         starts = [file.start_ns for file in self._files if file.channels]
         if not starts:
@@ -76,8 +74,56 @@ class LogReader:
         self, topics: Collection[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[RawMessage]:
         """Yields messages in log-time order, start_ns <= log time < end_ns; ties in file order."""
-        streams = [file.messages(topics, start_ns, end_ns) for file in self._files]
-        return heapq.merge(*streams, key=_log_time)
+        streams = [
+            _damage_named(path, file.messages(topics, start_ns, end_ns))
+            for path, file in zip(self.paths, self._files, strict=True)
+        ]
+        yield from heapq.merge(*streams, key=log_time)
+        self.require_unchanged()
+
+    def require_unchanged(self) -> None:
+        """Raises LogError if a recording is not the file any more that was opened: what was read of it may be mixed.
+
+        With salvage a recording may grow, as one does that is still being made; what came later is a loss.
+        """
+        for path, before in zip(self.paths, self._opened, strict=True):
+            now = _identity(path)
+            if now == before:
+                continue
+            if (
+                now is not None
+                and before is not None
+                and self._salvage
+                and now[:2] == before[:2]
+                and now[2] > before[2]
+            ):
+                note = f"{path.name}: it grew while it was read; what came later is left out"
+                if note not in self.losses.notes:
+                    self.losses.notes.append(note)
+                continue
+            how = "is gone" if now is None else "has been replaced or changed"
+            raise LogError(f"{path} {how} while it was read; nothing that came of it can be relied on, so do it again")
+
+
+class _Identity(NamedTuple):
+    """What tells a file from another one, and from itself at another time."""
+
+    device: int
+    inode: int
+    size: int
+    changed_ns: int
+
+    def grown_from(self, before: Self) -> bool:
+        """Tells whether this is the same file as before, only longer."""
+        return self[:2] == before[:2] and self.size > before.size
+
+
+def _identity(path: Path) -> _Identity | None:
+    try:
+        found = path.stat()
+    except OSError:  # who opens it says why
+        return None
+    return _Identity(found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns)
 
 
 def checksum(path: Path, abandoned: threading.Event | None = None) -> str | None:
@@ -96,290 +142,246 @@ def _names(paths: Iterable[Path]) -> str:
 
 
 class _IndexedFile:
-    """An intact MCAP file, read through its index."""
+    """An intact MCAP file, read through its index. What contradicts the index, or itself, is damage."""
 
     def __init__(self, path: Path):
         self._path = path
         with path.open("rb") as stream:
             try:
-                summary = SeekingReader(stream, validate_crcs=True).get_summary()
-                _check_summary_crc(stream)
-            except Exception as error:  # what mcap raises on damage has no common base
-                if isinstance(error, OSError) and error.errno != errno.EINVAL:  # that is a seek before the beginning
-                    raise
+                summary = _summary(stream)
+            except ValueError as error:  # DamageError; an empty file cannot be mapped
                 raise LogError(f"{path} is not a readable MCAP file ({_described(path, error)}){_HINT}") from error
         if summary is None or summary.statistics is None:
             raise LogError(f"{path} has no summary section: the recording was not closed{_HINT}")
-        counts = summary.statistics.channel_message_counts
         self._summary = summary
+        self._counts = summary.statistics.channel_message_counts
         self.start_ns = summary.statistics.message_start_time
         self.end_ns = summary.statistics.message_end_time
+        self._channels = {
+            number: declared(c, summary.schemas.get(c.schema_id)) for number, c in summary.channels.items()
+        }
         self.channels = tuple(
-            ChannelInfo(channel.topic, _schema_of(summary.schemas, channel), channel.message_encoding, count)
-            for identifier, channel in summary.channels.items()
-            if (count := counts.get(identifier, 0))
+            ChannelInfo(*channel, count)
+            for number, channel in self._channels.items()
+            if (count := self._counts.get(number))
         )
 
     def messages(
         self, topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
     ) -> Iterator[RawMessage]:
+        """Yields the messages of some topics, start_ns <= log time < end_ns, in log-time order."""
+        wanted = {number for number, (topic, *_) in self._channels.items() if topics is None or topic in topics}
+        found: Counter[int] = Counter()
         with self._path.open("rb") as stream:
-            raw = self._chunks(stream, topics, start_ns, end_ns) if self._summary.chunk_indexes else self._plain(stream)
-            for message in _damage_named(self._path, raw):
-                if (
-                    (topics is None or message.topic in topics)
-                    and (start_ns is None or message.log_time_ns >= start_ns)
-                    and (end_ns is None or message.log_time_ns < end_ns)
+            if self._summary.chunk_indexes:
+                raw = in_time_order(self._chunks(stream, wanted, start_ns, end_ns, found))
+            else:
+                raw = reordered(self._plain(stream, wanted, found))
+            for message in raw:
+                if (start_ns is None or message.log_time_ns >= start_ns) and (
+                    end_ns is None or message.log_time_ns < end_ns
                 ):
                     yield message
+        if (start_ns is None or start_ns <= self.start_ns) and (end_ns is None or end_ns > self.end_ns):
+            self._check_counts(wanted, found)
 
-    def _plain(self, stream: IO[bytes]) -> Iterator[RawMessage]:
-        """Yields the messages of a file without chunks."""
-        records = NonSeekingReader(stream, validate_crcs=True).iter_messages(log_time_order=False)
-        schemas = {number: _schema_of(self._summary.schemas, c) for number, c in self._summary.channels.items()}
-        return _reordered(_raw(schemas[channel.id], channel, message) for _, channel, message in records)
+    def _check_counts(self, wanted: Collection[int], found: Counter[int]) -> None:
+        """Raises LogError if not all messages that were recorded have been there."""
+        for number in wanted:
+            if found[number] != (count := self._counts.get(number, 0)):
+                topic = self._channels[number][0]
+                there = f"{found[number]} of {count} recorded messages of {topic!r} are there"
+                raise LogError(f"{self._path} is damaged ({there}){_HINT}")
 
     def _chunks(
-        self, stream: IO[bytes], topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
-    ) -> Iterator[RawMessage]:
-        """Yields the messages of the chunks that hold something wanted, in log-time order.
-
-        A message waits only for the chunks that begin before it. (mcap's own reader keeps every message in a heap with
-        a comparison in Python, which costs more than everything else there is to do with it.)
-        """
-        channels = self._summary.channels
-        schemas = {identifier: _schema_of(self._summary.schemas, channel) for identifier, channel in channels.items()}
-        wanted = {identifier for identifier, channel in channels.items() if topics is None or channel.topic in topics}
+        self, stream: IO[bytes], wanted: Collection[int], start_ns: int | None, end_ns: int | None, found: Counter[int]
+    ) -> Iterator[tuple[int, Iterable[RawMessage]]]:
+        """Yields the beginning in time, and the messages, of the chunks that hold something wanted."""
         chunks = sorted(
             (
                 chunk
                 for chunk in self._summary.chunk_indexes
-                if (not chunk.message_index_offsets or wanted & chunk.message_index_offsets.keys())
+                if (not chunk.message_index_offsets or not chunk.message_index_offsets.keys().isdisjoint(wanted))
                 and (start_ns is None or chunk.message_end_time >= start_ns)
                 and (end_ns is None or chunk.message_start_time < end_ns)
             ),
             key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset),
         )
-        waiting: list[RawMessage] = []
-        for chunk, following in zip_longest(chunks, chunks[1:]):
-            stream.seek(chunk.chunk_start_offset + _RECORD.size)
-            for identifier, log_time_ns, data in _chunk_messages(Chunk.read(ReadDataStream(stream))):
-                if identifier in wanted:
-                    channel = channels[identifier]
-                    encoding = channel.message_encoding
-                    waiting.append(RawMessage(channel.topic, log_time_ns, schemas[identifier], encoding, data))
-            waiting.sort(key=_log_time)
-            ready = bisect_left(waiting, following.message_start_time, key=_log_time) if following else len(waiting)
-            yield from waiting[:ready]
-            del waiting[:ready]
+        for chunk in chunks:
+            yield chunk.message_start_time, self._inside(stream, chunk, wanted, found)
 
-
-class _SalvagedFile:
-    """A damaged MCAP file, read chunk by chunk; bad chunks are left out and counted once.
-
-    Two passes: a topic may be declared in a chunk that is lost, and again in the summary at the end.
-    """
-
-    def __init__(self, path: Path, losses: Losses):
-        self._path = path
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
-        counts: Counter[int] = Counter()
-        recorded = 0
-        if path.stat().st_size == 0:
-            losses.notes.append(f"{path.name}: the file is empty")
-        else:
-            with path.open("rb") as stream, contextlib.suppress(OSError):  # a seek before the beginning
-                try:
-                    _check_summary_crc(stream)
-                except ValueError as error:
-                    losses.notes.append(f"{path.name}: {error}")
-        self.start_ns, self.end_ns = 2**63, 0
-        for record in self._records(losses):
-            if isinstance(record, Schema):
-                self._schemas[record.id] = record
-            elif isinstance(record, Channel):
-                self._channels[record.id] = record
-            elif isinstance(record, Message):
-                counts[record.channel_id] += 1
-                self.start_ns = min(self.start_ns, record.log_time)
-                self.end_ns = max(self.end_ns, record.log_time)
-            elif isinstance(record, Statistics):
-                recorded = record.message_count
-        if not losses.notes and counts.total() < recorded:
-            # a damaged record header hides a whole chunk without a trace of it
-            losses.notes.append(f"{path.name}: {recorded - counts.total()} of {recorded} recorded messages are missing")
-        if undeclared := sum(count for channel, count in counts.items() if channel not in self._channels):
-            losses.notes.append(f"{path.name}: {undeclared} messages of topics whose declaration is lost")
-        self._schema_of = {number: _schema_of(self._schemas, channel) for number, channel in self._channels.items()}
-        self.channels = tuple(
-            ChannelInfo(channel.topic, self._schema_of[identifier], channel.message_encoding, counts[identifier])
-            for identifier, channel in self._channels.items()
-            if counts[identifier]
-        )
-
-    def messages(
-        self, topics: Collection[str] | None, start_ns: int | None, end_ns: int | None
+    def _inside(
+        self, stream: IO[bytes], chunk: ChunkIndex, wanted: Collection[int], found: Counter[int]
     ) -> Iterator[RawMessage]:
-        raw = (
-            _raw(self._schema_of[record.channel_id], channel, record)
-            for record in self._records(Losses())
-            if isinstance(record, Message)
-            and (channel := self._channels.get(record.channel_id)) is not None
-            and (topics is None or channel.topic in topics)
-            and (start_ns is None or record.log_time >= start_ns)
-            and (end_ns is None or record.log_time < end_ns)
-        )
-        return _reordered(raw)
+        """Yields the wanted messages of one chunk; raises DamageError if it is not the one in the index."""
+        times_ns = chunk.message_start_time, chunk.message_end_time
+        yield from self._messages(_content(stream, chunk), wanted, found, times_ns)
 
-    def _records(self, losses: Losses) -> Iterator[McapRecord]:
-        """Yields the records of every intact chunk, in file order; looks for the next one behind what is damaged."""
-        if self._path.stat().st_size == 0:
-            return
-        with self._path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as view:
-            last = MAGIC_SIZE
-            at: int | None = last
-            while at is not None and at + _RECORD.size <= len(view):
-                opcode, length = _RECORD.unpack_from(view, at)
-                if opcode == Opcode.FOOTER and at + _RECORD.size + _FOOTER_END.size <= len(view):
-                    return
-                try:
-                    if opcode == Opcode.CHUNK:
-                        inside, following = _read_chunk(view, at)
-                        yield from inside
-                    else:
-                        record, following = _read_record(view, at)
-                        if record is not None:
-                            yield record
-                except Exception as error:  # what mcap raises on damage has no common base
-                    losses.chunks += opcode == Opcode.CHUNK
-                    what = "chunk" if opcode == Opcode.CHUNK else "record"
-                    losses.notes.append(
-                        f"{self._path.name}: {what} at byte {at} is damaged ({_described(self._path, error)})"
-                    )
-                    end = at + _RECORD.size + length
-                    following = end if _plausible(view, end) else _find_chunk(view, at + 1)
-                last, at = following or at, following
-            losses.notes.append(f"{self._path.name}: nothing readable after byte {last}")
+    def _messages(
+        self, content: bytes, wanted: Collection[int], found: Counter[int], times_ns: tuple[int, int]
+    ) -> Iterator[RawMessage]:
+        """Yields the wanted messages among the records of a chunk."""
+        start_ns, end_ns = times_ns
+        for opcode, begin, end in records_in(content):
+            if opcode == Opcode.MESSAGE:
+                number, _, log_time_ns, _ = MESSAGE.unpack_from(content, begin)
+                if not start_ns <= log_time_ns <= end_ns:
+                    raise DamageError(f"a chunk of {start_ns} to {end_ns} ns holds a message of {log_time_ns} ns")
+                if number in wanted:
+                    found[number] += 1
+                    topic, schema, encoding = self._channels[number]
+                    yield RawMessage(topic, log_time_ns, schema, encoding, content[begin + MESSAGE.size : end])
+                elif number not in self._channels:
+                    raise DamageError(f"a message is of channel {number}, which the summary does not declare")
+            elif opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
+                self._check(opcode, content[begin:end])
 
+    def _check(self, opcode: int, body: bytes) -> None:
+        """Raises DamageError if a declaration is not the one in the summary."""
+        summary = self._summary
+        match opcode:
+            case Opcode.CHANNEL:
+                channel = parsed(Channel, body)
+                known = summary.channels.get(channel.id)
+                if known is not None and (channel.topic, channel.message_encoding, channel.schema_id) != (
+                    known.topic,
+                    known.message_encoding,
+                    known.schema_id,
+                ):
+                    raise DamageError(f"channel {channel.id} is {channel.topic!r}, and {known.topic!r} in the summary")
+            case Opcode.SCHEMA:
+                schema = parsed(Schema, body)
+                if summary.schemas.get(schema.id, schema) != schema:
+                    raise DamageError(f"schema {schema.id}, {schema.name!r}, is another one in the summary")
 
-def _read_chunk(view: mmap.mmap, at: int) -> tuple[list[McapRecord], int | None]:
-    """Returns the records in the chunk at an offset and where to read on; raises if it is not what was written."""
-    view.seek(at + _RECORD.size)
-    chunk = Chunk.read(ReadDataStream(cast(IO[bytes], view)))  # by its own length: the record's may be damaged
-    if chunk.uncompressed_size > max(1 << 26, 1000 * len(chunk.data)):
-        raise ValueError(f"it claims to hold {chunk.uncompressed_size} bytes")
-    inside, end = breakup_chunk(chunk, validate_crc=True), view.tell()
-    _, length = _RECORD.unpack_from(view, at)
-    if end != at + _RECORD.size + length:  # one of the two lengths is wrong, though the content is not
-        return inside, _find_chunk(view, at + 1)
-    return inside, end
-
-
-def _read_record(view: mmap.mmap, at: int) -> tuple[McapRecord | None, int]:
-    """Returns the record at an offset, None if it is of a kind not needed here, and where it ends."""
-    if not _plausible(view, at):
-        raise ValueError("its header makes no sense")
-    opcode, length = _RECORD.unpack_from(view, at)
-    view.seek(at + _RECORD.size)
-    stream, end = ReadDataStream(cast(IO[bytes], view)), at + _RECORD.size + length
-    match opcode:
-        case Opcode.SCHEMA:
-            return Schema.read(stream), end
-        case Opcode.CHANNEL:
-            return Channel.read(stream), end
-        case Opcode.MESSAGE:
-            return Message.read(stream, length), end
-        case Opcode.STATISTICS:
-            return Statistics.read(stream), end
-    return None, end
+    def _plain(self, stream: IO[bytes], wanted: Collection[int], found: Counter[int]) -> Iterator[RawMessage]:
+        """Yields the wanted messages of a file without an index of chunks, in its order."""
+        crc, left = zlib.crc32(stream.read(len(MAGIC))), _size(stream) - len(MAGIC)
+        while left > 0:
+            record = stream.read(RECORD.size)
+            opcode, length = RECORD.unpack(record)
+            left -= RECORD.size + length
+            if left < 0:
+                raise DamageError(f"it is cut short or damaged: a record claims {length} bytes")
+            record += stream.read(length)
+            if opcode == Opcode.DATA_END:
+                expected = parsed(DataEnd, record[RECORD.size :]).data_section_crc
+                if expected and crc != expected:
+                    raise DamageError(f"the crc of all its data is {crc:08x} instead of {expected:08x}")
+                return
+            crc = zlib.crc32(record, crc)
+            if opcode == Opcode.CHUNK:
+                yield from self._messages(chunk_content(record, chunk_head(record, 0)), wanted, found, _ANY_TIME)
+            elif opcode in (Opcode.MESSAGE, Opcode.CHANNEL, Opcode.SCHEMA):
+                yield from self._messages(record, wanted, found, _ANY_TIME)
+        raise DamageError("it ends early")
 
 
-def _plausible(view: mmap.mmap, at: int) -> bool:
-    """Tells whether a record may begin at an offset."""
-    if at + _RECORD.size > len(view):
-        return False
-    opcode, length = _RECORD.unpack_from(view, at)
-    known = 1 <= opcode <= max(Opcode) or opcode >= 0x80  # the upper half is anybody's own
-    return bool(known and length <= len(view) - at - _RECORD.size)
-
-
-def _find_chunk(view: mmap.mmap, start: int) -> int | None:
-    """Returns where the next chunk seems to begin: an opcode, a length that fits, a compression that exists."""
-    at = start
-    while (at := view.find(bytes([Opcode.CHUNK]), at)) != -1:
-        name_at = at + _RECORD.size + _CHUNK_HEAD_BYTES
-        named = view[name_at : name_at + 8]
-        if _plausible(view, at) and named.startswith(_COMPRESSIONS):
-            return at
-        at += 1
-    return None
-
-
-_RECORD = struct.Struct("<BQ")  # opcode, length of what follows
-_FOOTER_END = struct.Struct("<QQI8s")  # summary start, summary offset start, CRC; then the magic that ends a file
-_CHUNK_HEAD_BYTES = 8 + 8 + 8 + 4  # start, end, uncompressed size, CRC, before the name of the compression
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time, before the data
-_MAGIC = b"\x89MCAP0\r\n"
-_COMPRESSIONS = tuple(struct.pack("<I", len(name)) + name for name in (b"zstd", b"lz4", b""))
+_FOOTER = struct.Struct("<BQQQI8s")  # opcode, length, summary start, summary offset start, CRC; the magic at the end
+_FOOTER_BYTES = 8 + 8 + 4
+_OF_SUMMARY: dict[int, type[Schema | Channel | ChunkIndex | Statistics]] = {
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.STATISTICS: Statistics,
+}
+_ANY_TIME = (0, 2**64 - 1)
 _OTHER_FORMATS = {b"#ROSBAG": "a ROS 1 bag", b"SQLite format 3": "a database, perhaps a ROS 2 bag of the older kind"}
-_log_time = attrgetter("log_time_ns")
 _HINT = "; try --salvage"
 
 
-def _open(path: Path, losses: Losses | None) -> _IndexedFile | _SalvagedFile:
+def _open(path: Path, losses: Losses | None) -> _IndexedFile | SalvagedFile:
     try:
         with path.open("rb") as stream:
             head = stream.read(16)
         for magic, kind in _OTHER_FORMATS.items():
             if head.startswith(magic):
                 raise LogError(f"{path} is {kind}, not MCAP: rosbags-convert makes MCAP of it, with --dst-storage mcap")
-        return _IndexedFile(path) if losses is None else _SalvagedFile(path, losses)
+        return _IndexedFile(path) if losses is None else SalvagedFile(path, losses)
     except OSError as error:
         raise LogError(f"{path} cannot be read: {error.strerror or error}") from error
 
 
 def _described(path: Path, error: Exception) -> str:
-    if path.stat().st_size == 0:
-        return "the file is empty"
-    name = type(error).__name__
-    known = {"EndOfFile": "it ends early", "RecordLengthLimitExceeded": "it is cut short or damaged"}
-    return known.get(name) or f"{str(error) or name}"
+    return "the file is empty" if path.exists() and path.stat().st_size == 0 else str(error)
 
 
-def _check_summary_crc(stream: IO[bytes]) -> None:
-    """Raises ValueError if the summary section is not what was written; mcap reads it unchecked.
+def _size(stream: IO[bytes]) -> int:
+    return os.fstat(stream.fileno()).st_size
 
-    The CRC is the footer's last field, and covers all from the beginning of the summary up to itself.
+
+def _summary(stream: IO[bytes]) -> Summary | None:
+    """Returns the summary section, None if there is none; raises DamageError if it is not what was written.
+
+    Its CRC is the footer's last field, and covers all from its beginning up to itself. Without one, and against a
+    forged one, what can be compared is compared.
     """
-    stream.seek(-_FOOTER_END.size, io.SEEK_END)
-    summary_start, _, crc, magic = _FOOTER_END.unpack(stream.read(_FOOTER_END.size))
-    if magic != _MAGIC:
-        raise ValueError("it does not end as an MCAP file does")
-    if summary_start and crc:
-        end = stream.seek(0, io.SEEK_END) - _FOOTER_END.size + 16  # the two offsets before the CRC are covered, too
-        stream.seek(summary_start)
-        if zlib.crc32(stream.read(end - summary_start)) != crc:
-            raise ValueError("the summary's CRC is wrong")
+    view = FileBytes(stream)
+    if view[: len(MAGIC)] != MAGIC:
+        raise DamageError("it does not begin as an MCAP file does")
+    footer_at = len(view) - _FOOTER.size
+    if footer_at < len(MAGIC):
+        raise DamageError("it ends early")
+    opcode, length, start, _, crc, magic = _FOOTER.unpack(view[footer_at:])
+    if (opcode, length, magic) != (Opcode.FOOTER, _FOOTER_BYTES, MAGIC):
+        raise DamageError("it does not end as an MCAP file does")
+    if start == 0:
+        return None
+    if start > footer_at:
+        raise DamageError(f"its summary begins at byte {start}, behind its end")
+    if crc and crc != crc_of(view, start, len(view) - len(MAGIC) - 4):
+        raise DamageError("the summary's CRC is wrong")
+    summary = _summary_in(view, start, footer_at)
+    _check_index(summary, start)
+    return summary
 
 
-def _chunk_messages(chunk: Chunk) -> Iterator[tuple[int, int, bytes]]:
-    """Yields channel id, log time and data of each message in a chunk, its CRC checked.
+def _summary_in(view: FileBytes, at: int, end: int) -> Summary:
+    summary = Summary()
+    while at < end:
+        opcode, following = record_at(view, at)
+        if following > end:
+            raise DamageError("a record of the summary reaches beyond its end")
+        if (kind := _OF_SUMMARY.get(opcode)) is not None:
+            match parsed(kind, view[at + RECORD.size : following]):
+                case Schema() as schema:
+                    summary.schemas[schema.id] = schema
+                case Channel() as channel:
+                    summary.channels[channel.id] = channel
+                case ChunkIndex() as index:
+                    summary.chunk_indexes.append(index)
+                case Statistics() as statistics:
+                    summary.statistics = statistics
+        at = following
+    return summary
 
-    As mcap's `breakup_chunk`, without an object per message and a read per field: a log has hundreds a second.
-    """
-    stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-    data = stream.read(length)
-    at = 0
-    while at < length:
-        opcode, size = _RECORD.unpack_from(data, at)
-        at += _RECORD.size
-        if at + size > length:
-            raise EndOfFile
-        if opcode == Opcode.MESSAGE:
-            identifier, _, log_time_ns, _ = _MESSAGE.unpack_from(data, at)
-            yield identifier, log_time_ns, data[at + _MESSAGE.size : at + size]
-        at += size
+
+def _check_index(summary: Summary, summary_start: int) -> None:
+    """Raises DamageError if there is a chunk where none can be, or times contradict each other."""
+    statistics = summary.statistics
+    for chunk in summary.chunk_indexes:
+        if chunk.chunk_start_offset + chunk.chunk_length > summary_start:
+            raise DamageError(f"its index has a chunk at byte {chunk.chunk_start_offset}, where none can be")
+        if statistics is not None and chunk.message_end_time:  # 0 in a chunk without messages
+            times_ns = statistics.message_start_time, chunk.message_start_time, chunk.message_end_time
+            if not times_ns[0] <= times_ns[1] <= times_ns[2] <= statistics.message_end_time:
+                raise DamageError("the times of its chunks and those of all its messages contradict each other")
+
+
+def _content(stream: IO[bytes], chunk: ChunkIndex) -> bytes:
+    """Returns what the chunk of an index entry holds; raises DamageError if it is not the one in the index."""
+    stream.seek(chunk.chunk_start_offset)
+    data = stream.read(chunk.chunk_length)  # no longer than the file, as the index has been checked
+    try:
+        opcode, end = record_at(data, 0)
+        head = chunk_head(data, 0)
+    except DamageError as error:
+        raise DamageError(f"the chunk at byte {chunk.chunk_start_offset} makes no sense: {error}") from error
+    if opcode != Opcode.CHUNK or not head.is_whole or end != len(data):
+        raise DamageError(f"the chunk at byte {chunk.chunk_start_offset} is none, or its lengths are wrong")
+    if (head.start_ns, head.end_ns) != (chunk.message_start_time, chunk.message_end_time):
+        raise DamageError(f"the chunk at byte {chunk.chunk_start_offset} and the index contradict each other")
+    return chunk_content(data, head)
 
 
 def _damage_named(path: Path, messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
@@ -389,26 +391,8 @@ def _damage_named(path: Path, messages: Iterator[RawMessage]) -> Iterator[RawMes
             message = next(messages)
         except StopIteration:
             return
-        except Exception as error:  # what mcap raises on damage has no common base
+        except OSError as error:
+            raise LogError(f"{path} cannot be read: {error.strerror or error}") from error
+        except (ValueError, struct.error) as error:  # DamageError; and what comes of a file that shrinks meanwhile
             raise LogError(f"{path} is damaged ({_described(path, error)}){_HINT}") from error
         yield message
-
-
-def _schema_of(schemas: Mapping[int, Schema], channel: Channel) -> LoggedSchema:
-    schema = schemas.get(channel.schema_id)
-    return LoggedSchema(schema.name, schema.encoding, schema.data) if schema else NO_SCHEMA
-
-
-def _raw(schema: LoggedSchema, channel: Channel, message: Message) -> RawMessage:
-    return RawMessage(channel.topic, message.log_time, schema, channel.message_encoding, message.data)
-
-
-def _reordered(messages: Iterable[RawMessage]) -> Iterator[RawMessage]:
-    """Sorts messages that are out of log-time order by less than REORDER_NS; stable."""
-    waiting: list[tuple[int, int, RawMessage]] = []
-    for index, message in enumerate(messages):
-        heapq.heappush(waiting, (message.log_time_ns, index, message))
-        while waiting[0][0] <= message.log_time_ns - REORDER_NS:
-            yield heapq.heappop(waiting)[2]
-    while waiting:
-        yield heapq.heappop(waiting)[2]

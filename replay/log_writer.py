@@ -7,7 +7,6 @@ messages alone has MCAP's profile ros2, so that rosbag2 opens it.
 """
 
 import contextlib
-import errno
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from replay.errors import OutputError
 from replay.frame_result import FrameResult
 from replay.logged_message import LoggedSchema
 from replay.merge import Recordings
+from replay.part_file import open_part, part_of
 from replay.scene_update import scene_update_bytes
 from schemas import codec, topics
 from schemas.topics import Topic
@@ -65,7 +65,7 @@ class LogWriter:
     """Writes one FrameResult after the other; a context manager.
 
     On a clean end, and on Ctrl-C, the file is closed and takes its final name. After any other error it stays as
-    NAME.part. Raises OutputError if the file cannot be written.
+    NAME.part. Raises OutputError if the file cannot be written, or if another process is writing it.
 
     Of merged recordings everything is copied; after Ctrl-C, or if `describe` says that the end came early, messages up
     to the last frame only, since the rest may take long.
@@ -80,7 +80,7 @@ class LogWriter:
     def __init__(self, path: Path, merge: Sequence[Path] = (), emit: Sequence[str] = DEFAULT_FORMATS):
         self._outputs = outputs(emit)
         self._path = path
-        self._part = path.with_name(path.name + ".part")
+        self._part = part_of(path)
         self._recordings = Recordings(merge)
         self._lineage = {"merged": self._recordings.origins} if merge else {}
         self._settings = b""
@@ -89,10 +89,8 @@ class LogWriter:
         self._sequence = 0
         self._last_ns = 0
         try:
-            if path.is_dir():
-                raise IsADirectoryError(errno.EISDIR, "Is a directory")
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._stream: IO[bytes] = self._part.open("wb")
+            self._stream: IO[bytes] = open_part(path)
         except OSError as error:
             raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)

@@ -30,6 +30,10 @@ class PictureError(ReplayError):
     """A picture that cannot be drawn or written."""
 
 
+class NoMatplotlib(PictureError):
+    """A picture for which matplotlib would have to be installed."""
+
+
 def busyness(result: FrameResult) -> float:
     """Returns how much there is to see near the vehicle: pedestrians predicted by the model, those on the move most.
 
@@ -67,23 +71,38 @@ def draw_top_down(result: FrameResult, path: Path) -> None:
 
     Raises PictureError if matplotlib is missing or the file cannot be written; a half-written one never stays.
     """
+    figure = new_figure(SIZE_IN, DPI)
+    axes = figure.add_axes((0.0, 0.0, MAP_SHARE, 1.0))
+    half_height = NEAR_M * SIZE_IN[1] / (SIZE_IN[0] * MAP_SHARE)
+    draw_scene(axes, result, result.sensors.map_from_vehicle[:2, 3], (NEAR_M, half_height))
+    _draw_legend(figure, result)
+    write_png(figure, path)
+
+
+def new_figure(size_in: tuple[float, float], dpi: int) -> Any:
+    """Returns an empty figure; raises NoMatplotlib if that is missing."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise PictureError('a picture needs matplotlib, which is not installed: pip install "pcgan[view]"') from error
-
-    figure = Figure(figsize=SIZE_IN, dpi=DPI, facecolor=_hex(colours.BACKGROUND))
+        raise NoMatplotlib('a picture needs matplotlib, which is not installed: pip install "pcgan[view]"') from error
+    figure = Figure(figsize=size_in, dpi=dpi, facecolor=_hex(colours.BACKGROUND))
     FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.0, 0.0, MAP_SHARE, 1.0))
-    _draw_ground(axes, result)
+    return figure
+
+
+def draw_scene(axes: Any, result: FrameResult, centre_m: FloatArray, half_m: tuple[float, float]) -> None:
+    """Draws all of a frame that lies within a rectangle: the ground, what was sensed, people, predictions, vehicle."""
+    _draw_ground(axes, centre_m, half_m)
     _draw_mixtures(axes, result)
     _draw_sensing(axes, result)
     _draw_paths(axes, result)
     _draw_people(axes, result)
     _draw_vehicle(axes, result)
-    _draw_legend(figure, result)
 
+
+def write_png(figure: Any, path: Path) -> None:
+    """Writes a figure; raises PictureError if the file cannot be written, and leaves no half of one."""
     part = path.with_name(path.name + ".part")
     try:
         # no software version inside: two runs write the same bytes
@@ -94,18 +113,15 @@ def draw_top_down(result: FrameResult, path: Path) -> None:
         raise PictureError(f"cannot write {path}: {error}") from error
 
 
-def _draw_ground(axes: Any, result: FrameResult) -> None:
+def _draw_ground(axes: Any, centre_m: FloatArray, half_m: tuple[float, float]) -> None:
     """Sets the section shown, and draws a grid of 5 m."""
-    x, y = result.sensors.map_from_vehicle[:2, 3].tolist()
-    half_height = NEAR_M * SIZE_IN[1] / (SIZE_IN[0] * MAP_SHARE)
-    axes.set_facecolor(_hex(colours.BACKGROUND))
-    axes.set(xlim=(x - NEAR_M, x + NEAR_M), ylim=(y - half_height, y + half_height), aspect="equal")
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-    axes.tick_params(length=0, labelbottom=False, labelleft=False)
-    for middle, half, line in ((x, NEAR_M, axes.axvline), (y, half_height, axes.axhline)):
-        for place in np.arange(np.ceil((middle - half) / 5) * 5, middle + half, 5):
-            line(place, color=_hex(colours.GRID), linewidth=0.6, zorder=0)
+    (x, y), (half_width, half_height) = centre_m.tolist(), half_m
+    axes.set(xlim=(x - half_width, x + half_width), ylim=(y - half_height, y + half_height), aspect="equal")
+    axes.set_axis_off()
+    places = [np.arange(np.ceil((c - h) / 5) * 5, c + h, 5) for c, h in ((x, half_width), (y, half_height))]
+    looks = {"colors": _hex(colours.GRID), "linewidth": 0.6, "zorder": 0}
+    axes.vlines(places[0], y - half_height, y + half_height, **looks)
+    axes.hlines(places[1], x - half_width, x + half_width, **looks)
 
 
 def _draw_mixtures(axes: Any, result: FrameResult) -> None:

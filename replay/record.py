@@ -11,11 +11,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Self
 
-from replay.errors import OutputError, PredictorError
+from replay.errors import LogError, OutputError, PredictorError
 from replay.frame_result import FrameResult
 from replay.interrupts import Interrupted, Interrupts
 from replay.log_reader import checksum
 from replay.log_writer import DEFAULT_FORMATS, LogWriter, outputs
+from replay.part_file import part_of, same_file
 from replay.rerun_view import NullView, View
 from replay.score import ReplayScore
 from replay.session import Replay
@@ -88,8 +89,8 @@ def record(
     `emit` names the forms in which tracks and predictions are written (`log_writer.FORMATS`).
 
     Ctrl-C, SIGTERM and a predictor that fails for good end it early: the outputs are then complete up to the last
-    frame, and the summary's `stopped` holds the reason. Raises LogError or OutputError for anything else; the output
-    then stays as NAME.part.
+    frame, and the summary's `stopped` holds the reason. Raises LogError or OutputError for anything else, a recording
+    that was changed meanwhile among it; the output then stays as NAME.part.
     """
     if output is not None:
         refuse_overwriting(run.reader.paths, output)
@@ -130,6 +131,7 @@ def record(
         interrupts.ignore()  # the outputs are being closed; that takes no time worth interrupting
         if writer is not None:
             digests = checksums.result(None if summary.complete else CHECKSUM_PATIENCE_S)
+            run.reader.require_unchanged()
             lineage = _lineage(run, digests, complete=summary.complete)
             writer.describe(lineage, _settings(run), complete=summary.complete)
     summary.wall_s = time.perf_counter() - ready
@@ -146,15 +148,13 @@ def record(
 
 
 def refuse_overwriting(recordings: Sequence[Path], *outputs: Path) -> None:
-    """Raises OutputError if an output, or the part it is written as, is a recording, or if two outputs are one file."""
-    for output in outputs:
-        for written in (output, output.with_name(output.name + ".part")):
-            if any(written.resolve() == path.resolve() for path in recordings):
-                raise OutputError(
-                    f"{written} is the recording itself, which is never overwritten; choose another output"
-                )
-        if sum(output.resolve() == other.resolve() for other in outputs) > 1:
-            raise OutputError(f"{output} would be written twice, the second time over the first; choose another name")
+    """Raises OutputError if an output, or the part it is written as, is a recording, or if two of them are one file."""
+    written = [path for output in outputs for path in (output, part_of(output))]
+    for one in written:
+        if any(same_file(one, recording) for recording in recordings):
+            raise OutputError(f"{one} is the recording itself, which is never overwritten; choose another output")
+        if sum(same_file(one, other) for other in written) > 1:
+            raise OutputError(f"{one} would be written twice, the second time over the first; choose another name")
 
 
 class _Checksums:
@@ -180,7 +180,10 @@ class _Checksums:
         """
         concurrent.futures.wait([self._digests], timeout=patience_s)
         self._abandoned.set()
-        return self._digests.result()
+        try:
+            return self._digests.result()
+        except OSError as error:
+            raise LogError(f"{error.filename} cannot be read any more: {error.strerror or error}") from error
 
 
 def _count(summary: Summary, result: FrameResult) -> None:

@@ -7,14 +7,14 @@ nothing: what a predictor that died left unanswered is sent again, in order, and
 import contextlib
 import queue
 import secrets
-import shutil
+import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import time
 from collections import OrderedDict, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Protocol, Self
@@ -23,9 +23,11 @@ import zenoh
 
 from pcgan.bus import ENCODING, BusError, ModelIdentity, any_alive_key, model_of, open_session, settle
 from replay.errors import PredictorError
+from replay.private_folder import PrivateFolder
 from schemas import codec, topics
 from schemas.messages import PredictionFrame, TrackFrame, VehiclePose
 
+MAX_WAITING_ANSWERS = 4096
 _POLL_S = 0.05
 
 
@@ -83,15 +85,38 @@ class InlinePredictor:
         """Does nothing."""
 
 
+@dataclass(frozen=True)
+class _Question:
+    """A frame that was asked, and what its answer must agree with."""
+
+    stamp_ns: int
+    frame_id: str
+    tracks: tuple[int, ...]
+    payload: bytes
+
+    def contradicted_by(self, answer: PredictionFrame) -> str | None:
+        """Returns what an answer says that does not go with the question, or None."""
+        if (answer.stamp_ns, answer.frame_id) != (self.stamp_ns, self.frame_id):
+            return f"{answer.frame_id!r} at {answer.stamp_ns} ns, asked was {self.frame_id!r} at {self.stamp_ns} ns"
+        answered = tuple(prediction.track_id for prediction in answer.predictions)
+        if answered != self.tracks:
+            return f"tracks {_listed(answered)}, asked were {_listed(self.tracks)}"
+        return None
+
+
 class StartError(PredictorError):
-    """A spawned predictor died before it served."""
+    """A spawned predictor does not serve; `hopeless` if it ended by itself, since another one would do the same."""
+
+    def __init__(self, problem: str, *, hopeless: bool):
+        super().__init__(problem)
+        self.hopeless = hopeless
 
 
 class Child:
     """A predictor process of our own, in its own process session so that Ctrl-C does not reach it."""
 
-    def __init__(self, endpoint: str, model: str | Path | None, log: IO[bytes]):
-        command = [sys.executable, "-m", "replay.cli", "predict", "--spawned", "--connect", endpoint]
+    def __init__(self, endpoint: str, folder: Path, model: str | Path | None, log: IO[bytes]):
+        command = [sys.executable, "-m", "replay.cli", "predict", "--spawned", str(folder), "--connect", endpoint]
         if model is not None:
             command += ["--model", str(model)]
         self._log = log
@@ -108,7 +133,18 @@ class Child:
             return None
         self._log.seek(self._log_start)
         words = self._log.read().decode(errors="replace").strip().splitlines()
-        return f"exit code {code}{': ' + words[-1] if words else ''}"
+        how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        return f"{how}{': ' + words[-1] if words else ''}"
+
+    @property
+    def killed(self) -> bool:
+        """True if a signal has ended it: another one may do better."""
+        return (self._process.poll() or 0) < 0
+
+    def kill(self) -> None:
+        """Ends it at once; what it was doing is lost."""
+        self._process.kill()
+        self.stop()
 
     def stop(self, patience_s: float = 5.0) -> None:
         """Closes its stdin, which ends it; kills it if it takes too long."""
@@ -145,9 +181,9 @@ class RemotePredictor:
         self._run = secrets.token_bytes(8)  # tells our answers from another replay's; never in an output
         self._child: Child | None = None
         self._child_arguments: tuple[str, str | Path | None] | None = None
-        self._folder: Path | None = None
+        self._folder: PrivateFolder | None = None
         self._log: IO[bytes] | None = None
-        self._unanswered: OrderedDict[int, bytes] = OrderedDict()
+        self._unanswered: OrderedDict[int, _Question] = OrderedDict()
         self._answers: dict[int, PredictionFrame] = {}
         self._alive: dict[str, ModelIdentity] = {}
         self._model: ModelIdentity | None = None
@@ -173,19 +209,24 @@ class RemotePredictor:
     @classmethod
     def spawned(cls, model: str | Path | None = None, **options: float) -> Self:
         """Starts a predictor process of our own on a private socket and waits until it serves."""
-        folder = Path(tempfile.mkdtemp(prefix="pcgan-"))
-        endpoint = _private_endpoint(folder)
+        folder = PrivateFolder()
+        endpoint = _private_endpoint(folder.path)
         try:
             predictor = cls(_opened(listen=[endpoint]), **options)  # type: ignore[arg-type]
-        except PredictorError:
-            shutil.rmtree(folder, ignore_errors=True)
+        except BaseException:
+            folder.remove()
             raise
         predictor._folder = folder
-        predictor._log = (folder / "predictor.log").open("w+b")
+        predictor._log = (folder.path / "predictor.log").open("w+b")
         predictor._child_arguments = (endpoint, model)
         try:
             predictor._start_child()
-            predictor._wait_until_ready()
+            try:
+                predictor._wait_until_ready()
+            except StartError as error:
+                if error.hopeless:  # it has said why it cannot start
+                    raise
+                predictor._replace(str(error))
         except BaseException:
             predictor.close()
             raise
@@ -220,7 +261,8 @@ class RemotePredictor:
         """Publishes a frame and the vehicle's pose; the frame stays on record until it is answered."""
         self._pose_publisher.put(codec.encode(pose), attachment=self._run)
         payload = codec.encode(frame)
-        self._unanswered[frame.sequence] = payload
+        tracks = tuple(track.id for track in frame.tracks)
+        self._unanswered[frame.sequence] = _Question(frame.stamp_ns, frame.frame_id, tracks, payload)
         self._publisher.put(payload, attachment=self._run)
 
     def answer(self) -> PredictionFrame:
@@ -244,6 +286,8 @@ class RemotePredictor:
 
     def close(self) -> None:
         """Ends the session and, if it was spawned, the predictor."""
+        if self._folder is not None:
+            self._folder.give_up()
         if self._child is not None:
             self._child.stop()
         elif self._unanswered:  # a run that was broken off: a plain close would damage a frame on its way to others'
@@ -252,7 +296,7 @@ class RemotePredictor:
         if self._log is not None:
             self._log.close()
         if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
+            self._folder.remove()
 
     def __enter__(self) -> Self:
         return self
@@ -261,18 +305,34 @@ class RemotePredictor:
         self.close()
 
     def _hear(self, sample: zenoh.Sample) -> None:
-        """Queues an answer of this run; others' are ignored, and do not pile up while nobody asks."""
-        if sample.attachment is not None and sample.attachment.to_bytes() == self._run:
+        """Queues an answer of this run; others' are ignored, and do not pile up while nobody asks.
+
+        Nor does a flood: what there is no room for counts as unanswered, and is asked again.
+        """
+        ours = sample.attachment is not None and sample.attachment.to_bytes() == self._run
+        if ours and self._inbox.qsize() < MAX_WAITING_ANSWERS:
             self._inbox.put(sample)
 
     def _take(self, sample: zenoh.Sample) -> None:
-        """Files an answer; second answers to one sequence are ignored."""
+        """Files an answer; second answers to one sequence, and answers to what nobody asked, are ignored.
+
+        Raises PredictorError if it is none to its question: nothing wrong may get into an output unnoticed.
+        """
         try:
             frame = codec.decode(PredictionFrame, sample.payload.to_bytes())
         except codec.CodecError as error:
             raise PredictorError(f"the predictor's answer makes no sense: {error}") from error
-        if frame.sequence in self._unanswered:
-            self._answers.setdefault(frame.sequence, frame)
+        question = self._unanswered.get(frame.sequence)
+        if question is None or frame.sequence in self._answers:
+            return
+        if (problem := question.contradicted_by(frame)) is not None:
+            raise PredictorError(f"the predictor's answer to frame {frame.sequence} is to another question: {problem}")
+        if self._model is not None and frame.model != self._model.name:
+            raise PredictorError(
+                f"the predictor's answer to frame {frame.sequence} is of the weights {frame.model}, "
+                f"and it said that it runs {self._model.name}"
+            )
+        self._answers[frame.sequence] = frame
 
     def _trouble(self, silent: bool) -> str | None:
         """Returns why no answer can be expected, or None."""
@@ -291,7 +351,7 @@ class RemotePredictor:
             raise PredictorError(f"{reason}; {self._max_failures} replacements gave no answer either")
         self.restarts += 1
         if self._child is not None:
-            self._child.stop(patience_s=0)
+            self._child.kill()
             self._alive.clear()
             self._start_child()
         try:
@@ -299,16 +359,17 @@ class RemotePredictor:
         except StartError as error:  # one that dies while it starts is one failure more, not the end
             self._replace(str(error))
             return
-        for sequence, payload in self._unanswered.items():
+        for sequence, question in self._unanswered.items():
             if sequence not in self._answers:
-                self._publisher.put(payload, attachment=self._run)
+                self._publisher.put(question.payload, attachment=self._run)
 
     def _start_child(self) -> None:
         assert self._child_arguments is not None
         assert self._log is not None
+        assert self._folder is not None
         endpoint, model = self._child_arguments
         self._log.seek(0, 2)
-        self._child = Child(endpoint, model, self._log)
+        self._child = Child(endpoint, self._folder.path, model, self._log)
 
     def _wait_until_ready(self) -> None:
         """Waits for a predictor's token and for zenoh to have matched our publisher: what is put before is lost."""
@@ -318,8 +379,10 @@ class RemotePredictor:
             if self._alive and _matched(self._publisher):
                 break
             if self._child is not None and (ending := self._child.died()) is not None:
-                raise StartError(f"the predictor did not start ({ending})")
+                raise StartError(f"the predictor did not start ({ending})", hopeless=not self._child.killed)
             if time.monotonic() > deadline:
+                if self._child is not None:
+                    raise StartError(f"the predictor was not ready within {self._startup_s:g} s", hopeless=False)
                 raise PredictorError(
                     f"no predictor was ready within {self._startup_s:g} s; start one with: pcgan predict"
                 )
@@ -339,6 +402,11 @@ class RemotePredictor:
                 self._alive[key] = found
             elif self._alive.pop(key, None) is not None:
                 self._left = True  # what it had not answered is lost, even if another has come since
+
+
+def _listed(ids: Sequence[int]) -> str:
+    """Returns some ids in words; many of them would fill a screen."""
+    return f"{', '.join(map(str, ids[:8]))}{f' and {len(ids) - 8} more' if len(ids) > 8 else ''}" or "none"
 
 
 def _drained(news: "queue.SimpleQueue[tuple[zenoh.SampleKind, str]]") -> Iterator[tuple[zenoh.SampleKind, str]]:

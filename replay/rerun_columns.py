@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import pyarrow as pa  # type: ignore[import-untyped]  # comes with rerun-sdk
+import pyarrow as pa  # comes with rerun-sdk
 import rerun as rr
 from numpy.typing import NDArray
 

@@ -3,17 +3,21 @@
 rerun-sdk is an optional dependency: it is imported when a `RerunView` is made, not before.
 """
 
+import io
 import math
-from contextlib import suppress
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import IO, TYPE_CHECKING, Protocol, Self
 
 import numpy as np
 
 from replay.errors import ReplayError
 from replay.frame_result import FrameResult
 from replay.image_size import image_size_px
+from replay.part_file import open_part, part_of
 from schemas.messages import FloatArray
 
 if TYPE_CHECKING:
@@ -24,6 +28,7 @@ if TYPE_CHECKING:
 APPLICATION = "pcgan"
 FRAMES_PER_BATCH = 50  # sent at once
 VIEWER_PATIENCE_S = 0.05  # a viewer gets what there is after this: in real time, every frame as it comes
+_END, _END_BYTES = b"RRF2FOOT", 64  # what the last bytes of an .rrd file hold
 FAR_FROM_ORIGIN_M = 10_000.0  # rerun draws in single precision: a map farther out is shifted towards its own start
 
 
@@ -68,6 +73,7 @@ class RerunView:
         self._recording: rr.RecordingStream | None = recording
         self._columns = RerunColumns(recording, FRAMES_PER_BATCH, patience_s)
         self._path = path
+        self._claim: IO[bytes] | None = None  # keeps other processes from writing the same part
         self.viewer: Viewer | None = None  # of a spawned view, for whoever wants to end it
         self._origin_m: FloatArray | None = (
             None  # (3,)  what is subtracted from the odometry frame; None before a frame
@@ -81,16 +87,20 @@ class RerunView:
         """Returns a view that writes an .rrd file: `path` with `.part` behind it, renamed once it is complete.
 
         Two runs with one `recording_id` (take what names the input, such as its checksum) give recordings that
-        `rerun rrd compare --unordered` finds equal. Raises ViewError if the file cannot be made.
+        `rerun rrd compare --unordered` finds equal. Raises ViewError if the file cannot be made, OutputError if another
+        process is writing it.
         """
-        recording = _new_recording(recording_id)
-        part = _part(path)
+        with _rerun_quiet():
+            recording = _new_recording(recording_id)
+        part = part_of(path)
         try:
-            part.touch()  # rerun reports a place that cannot be written only later, from another thread
+            claim = open_part(path)  # rerun reports a place that cannot be written only later, from another thread
             recording.save(str(part))
         except (OSError, RuntimeError) as error:
-            raise ViewError(f"cannot write {part}: {error}") from error
-        return cls(recording, path)
+            raise ViewError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}") from error
+        view = cls(recording, path)
+        view._claim = claim
+        return view
 
     @classmethod
     def spawn(cls, recording_id: str = "replay", *, headless: bool = False) -> "RerunView":
@@ -131,13 +141,18 @@ class RerunView:
             return
         recording, self._recording = self._recording, None
         try:
-            self._columns.flush()
+            with nullcontext() if complete else suppress(IndexError, ValueError):  # it may end in the middle of a row
+                self._columns.flush()
             recording.flush()
             recording.disconnect()
             if self._path is not None and complete:
-                _part(self._path).replace(self._path)
+                _require_whole(part_of(self._path))
+                part_of(self._path).replace(self._path)
         except (OSError, RuntimeError, ValueError) as error:
             raise ViewError(f"the rerun recording could not be completed: {error}") from error
+        finally:
+            if self._claim is not None:
+                self._claim.close()
 
     def show(self, result: FrameResult) -> None:
         """Draws one frame; it is found under its stamp and its sequence."""
@@ -197,8 +212,27 @@ def _media_type(image_format: str) -> str:
     return f"image/{known[0]}" if known else "image/jpeg"
 
 
-def _part(path: Path) -> Path:
-    return path.with_name(path.name + ".part")
+def _require_whole(part: Path) -> None:
+    """Raises OSError unless a recording has its end: if that alone did not fit on the disk, rerun only logs it."""
+    with part.open("rb") as stream:
+        stream.seek(-min(_END_BYTES, part.stat().st_size), io.SEEK_END)
+        if _END not in stream.read():
+            raise OSError(f"{part} lacks its end; is the disk full?")
+
+
+@contextmanager
+def _rerun_quiet() -> Iterator[None]:
+    """Has rerun log nothing, if it starts in the block: of a full disk it logs several lines, where we say one.
+
+    The variable must not stay: zenoh, here and in processes that are started later, goes by it, too.
+    """
+    chosen = os.environ.get("RUST_LOG")
+    os.environ["RUST_LOG"] = chosen or "off"
+    try:
+        yield
+    finally:
+        if chosen is None:
+            del os.environ["RUST_LOG"]
 
 
 def _new_recording(recording_id: str) -> "rr.RecordingStream":

@@ -54,15 +54,32 @@ def start_viewer(*, headless: bool = False, window_size: tuple[int, int] | None 
         ViewerError: rerun is not installed, or its viewer ends or stays silent; with its last words.
     """
     port = _free_port()
-    command = [_executable(), "--bind", HOST, "--port", str(port), "--hide-welcome-screen", "--expect-data-soon"]
+    command = [rerun_program(), "--bind", HOST, "--port", str(port), "--hide-welcome-screen", "--expect-data-soon"]
     command += ["--headless"] if headless else []
     command += ["--window-size", "{}x{}".format(*window_size)] if window_size else []
+    return _start(command, port, f"rerun+http://{HOST}:{port}/proxy", headless=headless)
+
+
+def start_web_viewer() -> Viewer:
+    """Starts a server on a free loopback port that hands out the viewer for browsers; `url` is its address.
+
+    Raises ViewerError if rerun is not installed, or its server ends or stays silent.
+    """
+    port = _free_port()
+    url = f"http://{HOST}:{port}"
+    # with something to show named, rerun opens no port for programs that log
+    command = [rerun_program(), "--serve-web", "--bind", HOST, "--web-viewer-port", str(port), f"{url}/none.rrd"]
+    return _start(command, port, url, headless=False)
+
+
+def _start(command: list[str], port: int, url: str, *, headless: bool) -> Viewer:
+    """Starts rerun and waits until it listens; raises ViewerError with its last words if it does not."""
     # An own session keeps Ctrl-C in the terminal from closing what the user is looking at.
     with tempfile.TemporaryFile() as output:
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
         )
-        viewer = Viewer(process, f"rerun+http://{HOST}:{port}/proxy")
+        viewer = Viewer(process, url)
         deadline = time.monotonic() + START_LIMIT_S
         while process.poll() is None and time.monotonic() < deadline and not _listens(port):
             time.sleep(0.05)
@@ -86,7 +103,8 @@ def headless_viewer(window_size: tuple[int, int]) -> Iterator[Viewer]:
         viewer.stop()
 
 
-def _executable() -> str:
+def rerun_program() -> str:
+    """Returns the path of the program "rerun"; raises ViewerError if it is not installed."""
     beside = Path(sys.executable).with_name("rerun")
     found = str(beside) if beside.exists() else shutil.which("rerun")
     if found is None:

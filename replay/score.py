@@ -98,7 +98,7 @@ class ReplayScore:
             self._true.clear()
         tracks, truth = result.tracks.tracks, result.ground_truth
         stamp_ns = result.tracks.stamp_ns
-        self._tracked.append(_track_positions(stamp_ns, tracks))
+        self._tracked.append(track_positions(stamp_ns, tracks))
         person_of: IntArray = np.full(len(tracks), -1, np.int64)
         if truth is not None:
             self._true.append(true_positions(truth))
@@ -263,7 +263,8 @@ def lookup(seen: Sequence[Positions], ids: IntArray, steps_ns: IntArray) -> tupl
     return start + fraction[..., None] * (end - start), np.asarray(inside & (gap_ns <= MAX_GAP_NS))
 
 
-def _track_positions(stamp_ns: int, tracks: Sequence[Track]) -> Positions:
+def track_positions(stamp_ns: int, tracks: Sequence[Track]) -> Positions:
+    """Returns where the tracks of a frame are; coasting ones do not count as measured."""
     ids = np.array([track.id for track in tracks], np.int64)
     order = np.argsort(ids)
     positions = np.array([track.state[:2] for track in tracks], float).reshape(-1, 2)

@@ -402,6 +402,8 @@ def _decode_tracks(tracks: Sequence[pb.Track]) -> tuple[Track, ...]:
     _check_finite(present.T, pb.Track.DESCRIPTOR, ("x", "y", "vx", "vy", "existence"))
     outside = np.flatnonzero((present[:, 4] < 0) | (present[:, 4] > 1))
     _require(len(outside) == 0, tracks[0], f"existence {present[outside[:1], 4]} is outside 0 to 1")
+    youngest = min(track.age_ns for track in tracks)
+    _require(youngest >= 0, tracks[0], f"has the age {youngest} ns")
     wires = [_packed_fields(track.SerializeToString()) for track in tracks]
     covariances, sizes = _table(pb.Track.DESCRIPTOR, wires, ("covariance",))
     _require(set(sizes) == {16}, tracks[0], f"covariance has {max(sizes, key=lambda n: n != 16)} entries instead of 16")
@@ -433,6 +435,8 @@ def _rising_stamps(descriptor: Descriptor, wires: Sequence[dict[int, bytes]], le
     for stamps_found, length in zip(found, lengths, strict=True):
         if stamps_found != length:
             raise CodecError(f"{descriptor.name} has {length} states but {stamps_found} stamps")
+    if (earliest := stamps_ns.min(initial=1)) <= 0:
+        raise CodecError(f"{descriptor.name} has no stamp for every state (stamp_ns {earliest})")
     rises = np.diff(stamps_ns) > 0
     ends = np.cumsum(lengths)[:-1]
     rises[ends[(ends > 0) & (ends < len(stamps_ns))] - 1] = True  # from one history to the next
@@ -477,6 +481,7 @@ def _encode_prediction_frame(frame: PredictionFrame) -> Message:
 def _decode_prediction_frame(message: pb.PredictionFrame) -> PredictionFrame:
     _check_stamp(message)
     _require(message.dt_s > 0 and math.isfinite(message.dt_s), message, f"dt_s {message.dt_s} is not positive")
+    _check_scalars(message, "dt_s")
     ids = {prediction.track_id for prediction in message.predictions}
     _require(len(ids) == len(message.predictions), message, "has two predictions of one track")
     _require(max(ids, default=0) < 2**63, message, f"predicts a track of the id {max(ids, default=0)}, more than 2^63")
@@ -512,7 +517,7 @@ def _decode_predictions(predictions: Sequence[pb.Prediction]) -> tuple[Predictio
         risk = prediction.corridor_probability
         _require(0 <= risk <= 1, prediction, f"corridor_probability {risk} is outside 0 to 1")
         time_s = prediction.corridor_time_s if prediction.HasField("corridor_time_s") else None
-        _require(time_s is None or 0 <= time_s < math.inf, prediction, f"corridor_time_s {time_s} makes no sense")
+        _require(time_s is None or 0 <= time_s <= LARGEST, prediction, f"corridor_time_s {time_s} makes no sense")
         decoded.append(Prediction(prediction.track_id, prediction.fallback, tree, mixture, risk, time_s))
     return tuple(decoded)
 

@@ -266,6 +266,11 @@ def _check(camera: CameraModel) -> None:
     numbers = (camera.fx, camera.fy, camera.cx, camera.cy)
     if not all(map(math.isfinite, numbers)) or camera.fx <= 0 or camera.fy <= 0:
         raise CalibrationError(f"focal lengths and centre {numbers} must be finite, focal lengths positive")
+    if not all(1e-3 < f / size < 1e3 for f, size in ((camera.fx, camera.width_px), (camera.fy, camera.height_px))):
+        raise CalibrationError(
+            f"focal lengths ({camera.fx:.6g}, {camera.fy:.6g}) px are those of no lens over a "
+            f"{camera.width_px} x {camera.height_px} image"
+        )
     # A cropped image may have its centre outside, but not by more than its own size.
     if abs(camera.cx / camera.width_px - 0.5) > 1.5 or abs(camera.cy / camera.height_px - 0.5) > 1.5:
         raise CalibrationError(

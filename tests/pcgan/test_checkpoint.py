@@ -153,6 +153,9 @@ def test_pickle_is_never_opened(tmp_path):
         (lambda h: h["config"].update(uses_vehicle=False), "gvat.phi_vehicle"),
         (lambda h: h["config"].update(pooling="social"), "differ in the weights"),
         (lambda h: h["config"].update(dt_s=-1.0), "dt_s must be positive"),
+        (lambda h: h["config"].update(hidden=10**9), r"hidden is 1000000000, more than any network has \(10000\)"),
+        (lambda h: h["config"].update(predicted_steps=10**400), "predicted_steps is 1000.*, more than any network has"),
+        (lambda h: h["config"].update(hidden=10_000, embedding=10_000), r"weight .* its configuration needs"),
         (lambda h: h.pop("config"), "config"),
         (lambda h: h.update(config=[1]), "small.safetensors"),
     ],
@@ -162,6 +165,15 @@ def test_header_that_differs_is_refused(saved, change, problem):
     rewrite(path, change)
     with pytest.raises(CheckpointError, match=problem):
         checkpoint.load_generator(path)
+
+
+@pytest.mark.parametrize("text", ["{", "1" * 5000, "[" * 100_000, "[]", "null"], ids=lambda text: text[:5])
+def test_header_that_is_no_json_object_is_refused(tmp_path, text):
+    path = tmp_path / "odd.safetensors"
+    safetensors.torch.save_file({"w": torch.zeros(2)}, path, {"pcgan": text})
+    with pytest.raises(CheckpointError, match=r"odd\.safetensors has a header that cannot be read") as refusal:
+        checkpoint.describe(path)
+    assert len(str(refusal.value)) < 500
 
 
 def test_format_of_before_is_refused_by_its_header_alone(saved):

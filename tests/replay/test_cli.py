@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -48,7 +49,7 @@ def inline(pcgan, model):
 def test_the_commands():
     words = {name[0] for name in COMMANDS}
     drives = {"replay", "simulate", "predict", "info", "inspect", "label", "export"}
-    drives |= {"track", "play", "record", "whatif"}
+    drives |= {"track", "play", "record", "whatif", "diff", "check", "report", "batch"}
     assert words == drives | {"models", "train", "windows", "evaluate", "data"}
     assert {("data", "list"), ("data", "get")} <= set(COMMANDS)
 
@@ -70,8 +71,12 @@ def test_pcgan_alone_lists_the_commands(pcgan):
     assert outcome.code == 0
     for name in COMMANDS:
         assert f"│ {name[0]} " in outcome.out
-    for panel in ("Drives", "Live", "Models", "Data"):
+    for panel in ("Drives", "Regression", "Live", "Models", "Data"):
         assert f"─ {panel} ─" in outcome.out
+
+
+def test_the_version_is_the_packages(pcgan):
+    assert pcgan("--version") == (0, f"{version('pcgan')}\n", "")
 
 
 @pytest.mark.parametrize("name", COMMANDS, ids=" ".join)
@@ -207,7 +212,7 @@ def test_a_profile_in_toml_gives_roles_and_settings(inline, short_drive, tmp_pat
     assert inline(short_drive, "-o", tmp_path / "out.mcap", "--profile", profile).code == 0
     used = json.loads(mcap_content(tmp_path / "out.mcap").attachments["settings.json"])
     assert (used["duration_s"], used["roles"]["pose"], used["sync"]["wait_ms"]) == (0.5, ODOMETRY_TOPIC, 250)
-    for text, words in (("[roles", "is not TOML"), ("speed = 1", "is no profile: speed: Extra inputs")):
+    for text, words in (("[roles", "is not TOML"), ("speed = 1", "speed: there is nothing of this name")):
         profile.write_text(text)
         outcome = inline(short_drive, "--profile", profile)
         assert outcome.code == 2

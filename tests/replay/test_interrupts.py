@@ -1,14 +1,15 @@
-"""Ctrl-C and SIGTERM: at once, after a shielded block, or not at all."""
+"""Ctrl-C, SIGTERM and SIGHUP: at once, after a shielded block, or not at all."""
 
 import os
 import signal
 import threading
+import time
 
 import pytest
 
-from replay.interrupts import Interrupted, Interrupts
+from replay.interrupts import REPEAT_S, Interrupted, Interrupts
 
-SIGNALS = [signal.SIGINT, signal.SIGTERM]
+SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
 def send(signum):
@@ -77,6 +78,40 @@ def test_once_ignored_a_signal_changes_nothing():
 
     enter(work)
     assert done == SIGNALS
+
+
+def test_whoever_is_impatient_does_not_interrupt_the_tidying_up(monkeypatch):
+    """A second signal, and more, while the first one is being obeyed; later ones are heard again."""
+    clock = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    tidied = []
+
+    def work(interrupts):
+        try:
+            with interrupts.shield():
+                send(signal.SIGINT)
+                send(signal.SIGTERM)
+        finally:
+            for signum in SIGNALS:
+                send(signum)
+                tidied.append(signum)
+            clock[0] += REPEAT_S
+            send(signal.SIGTERM)
+            tidied.append("never")
+
+    found = interrupted(work)
+    assert (found.signum, tidied) == (signal.SIGTERM, SIGNALS)
+    assert found.__context__.signum == signal.SIGINT  # the first of the two in the block
+
+
+def test_where_nohup_has_sighup_ignored_it_stays_so():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with Interrupts():
+            send(signal.SIGHUP)
+            assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_an_error_in_a_shielded_block_is_not_hidden_by_a_signal():

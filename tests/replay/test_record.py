@@ -353,17 +353,23 @@ def predictor_command(tmp_path, monkeypatch):
     return use
 
 
-# Joins the bus as predictor and calls `step` for every frame; argv: -m replay.cli predict --spawned --connect ENDPOINT
+# Joins the bus as predictor and calls `step` for every frame; argv: ... predict --spawned FOLDER --connect ENDPOINT
 DOUBLE = """
 import os, sys, time
+import numpy as np
 from pcgan import bus
 from pcgan.predictor_process import run
-from schemas.messages import PredictionFrame
+from schemas.messages import Mixture, ModalPath, Prediction, PredictionFrame
+
+PATHS = (ModalPath(1.0, np.zeros((1, 2))),)
+ONES = np.ones((1, 1), np.float32)
+MIXTURE = Mixture(ONES, np.zeros((1, 1, 2), np.float32), np.ones((1, 1, 2), np.float32), 0 * ONES)
 
 class Double:
     def step(self, frame):
         {step}
-        return PredictionFrame(frame.sequence, frame.stamp_ns, frame.frame_id, "double", 0.1)
+        answers = tuple(Prediction(track.id, True, PATHS, MIXTURE) for track in frame.tracks)
+        return PredictionFrame(frame.sequence, frame.stamp_ns, frame.frame_id, "double", 0.1, answers)
 
 session = bus.open_session(connect=[sys.argv[sys.argv.index("--connect") + 1]])
 run(session, Double(), bus.ModelIdentity("double", "00"), end_with_stdin=True)

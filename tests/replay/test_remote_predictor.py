@@ -19,14 +19,14 @@ MODEL = bus.ModelIdentity("double", "00")
 
 
 class Double:
-    """Answers with its own name and remembers what it was asked."""
+    """Answers with a time step of its own, by which it is known, and remembers what it was asked."""
 
-    def __init__(self, name="double"):
-        self.name, self.seen = name, []
+    def __init__(self, dt_s=0.1):
+        self.dt_s, self.seen = dt_s, []
 
     def step(self, frame):
         self.seen.append(frame.sequence)
-        return PredictionFrame(frame.sequence, frame.stamp_ns, frame.frame_id, self.name, 0.1)
+        return PredictionFrame(frame.sequence, frame.stamp_ns, frame.frame_id, MODEL.name, self.dt_s)
 
 
 class Server:
@@ -126,13 +126,13 @@ def test_answers_to_others_are_ignored(asker, server, frame, make):
 
 
 def test_of_two_answers_the_first_counts(asker, server, frame, make):
-    predictor, one, two = asker(), server(Double("one")), server(Double("two"))
+    predictor, one, two = asker(), server(Double(0.1)), server(Double(0.2))
     ready(predictor)
     time.sleep(0.3)
     ask(predictor, map(frame, range(10)), make)
     answers = [predictor.answer() for _ in range(10)]
     assert [answer.sequence for answer in answers] == list(range(10))
-    assert {answer.model for answer in answers} <= {"one", "two"}
+    assert {answer.dt_s for answer in answers} <= {0.1, 0.2}
     assert one.thread.is_alive()
     assert two.thread.is_alive()
 
@@ -144,12 +144,12 @@ def test_when_the_predictor_leaves_the_next_one_gets_what_is_unanswered(asker, s
     assert predictor.answer().sequence == 0
     first.stop()
     ask(predictor, map(frame, range(1, 6)), make)  # nobody hears these
-    server(Double("second"))
+    server(Double(0.2))
     asked_s = time.monotonic()
     answers = [predictor.answer() for _ in range(5)]
     assert time.monotonic() - asked_s < 4  # known from its token, not from silence
     assert [answer.sequence for answer in answers] == [1, 2, 3, 4, 5]
-    assert {answer.model for answer in answers} == {"second"}
+    assert {answer.dt_s for answer in answers} == {0.2}
     assert predictor.restarts == 1
 
 
@@ -194,7 +194,7 @@ def test_failures_are_counted_in_a_row(asker, server, frame, make):
         def step(self, frame):
             self.seen.append(frame.sequence)
             lost = len(self.seen) % 2
-            return PredictionFrame(10**6 if lost else frame.sequence, frame.stamp_ns, "odom", "x", 0.1)
+            return PredictionFrame(10**6 if lost else frame.sequence, frame.stamp_ns, "odom", MODEL.name, 0.1)
 
     predictor = asker(hang_s=0.2, max_failures=1)
     server(EverySecond())

@@ -2,6 +2,7 @@
 
 import builtins
 import io
+import os
 import re
 import shutil
 import subprocess
@@ -84,7 +85,7 @@ def test_closing_early_and_twice(tmp_path):
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path):
-    with pytest.raises(ViewError, match=r"cannot write .*nowhere"):
+    with pytest.raises(ViewError, match=r"nowhere.* cannot be written: No such file or directory$"):
         RerunView.to_file(tmp_path / "nowhere" / "a.rrd")
 
 
@@ -201,3 +202,12 @@ def test_a_live_view_reaches_its_viewer():
     finally:
         view.viewer.stop()
     assert view.viewer.process.poll() is not None
+
+
+def test_a_recording_leaves_the_environment_as_it_was(tmp_path, monkeypatch):
+    for chosen in (None, "debug"):
+        monkeypatch.delenv("RUST_LOG", raising=False)
+        if chosen is not None:
+            monkeypatch.setenv("RUST_LOG", chosen)
+        RerunView.to_file(tmp_path / f"{chosen}.rrd").close(complete=False)
+        assert os.environ.get("RUST_LOG") == chosen

@@ -334,6 +334,12 @@ REFUSED = {
         track_frame(track({**STEP, "coasting": []})),
         "TrackHistory arrays differ in length",
     ),
+    "an age below 0": (TrackFrame, track_frame(track(age_ns=-1)), "Track has the age -1 ns"),
+    "a history from before 1970": (
+        TrackFrame,
+        track_frame(track({**STEP, "stamp_ns": [-5]})),
+        r"TrackHistory has no stamp for every state \(stamp_ns -5\)",
+    ),
     "stamps that stand still": (TrackFrame, track_frame(track(TWO)), "TrackHistory stamps do not rise"),
     "a vehicle going back in time": (
         TrackFrame,
@@ -345,6 +351,21 @@ REFUSED = {
     "no time step": (PredictionFrame, prediction_frame(dt_s=0), r"dt_s 0\.0 is not positive"),
     "an infinite time step": (PredictionFrame, prediction_frame(dt_s=INF), "dt_s inf is not positive"),
     "a NaN time step": (PredictionFrame, prediction_frame(dt_s=NAN), "dt_s nan is not positive"),
+    "an absurd time step": (PredictionFrame, prediction_frame(dt_s=1e300), r"dt_s is 1e\+300, more than 1e\+09"),
+    "an absurd time to the corridor": (
+        PredictionFrame,
+        prediction_frame(
+            predictions=[
+                pb.Prediction(
+                    track_id=4,
+                    paths=[pb.ModalPath(probability=1, x=[0, 0], y=[0, 0])],
+                    mixture=mixture(),
+                    corridor_time_s=1e30,
+                )
+            ]
+        ),
+        r"corridor_time_s 1e\+30 makes no sense",
+    ),
     "a prediction without a path": (PredictionFrame, prediction_frame(paths=[]), "Prediction has no path"),
     "a probability above 1": (
         PredictionFrame,

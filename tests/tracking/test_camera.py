@@ -126,6 +126,11 @@ def test_pixel_that_no_direction_reaches_has_no_ray():
         ({"distortion": [np.nan, 0, 0, 0]}, "not finite"),
         ({"K": np.zeros((3, 3))}, "K must be"),
         ({"K": [[0, 0, 900], [0, 1000, 600], [0, 0, 1]]}, "focal lengths positive"),
+        (
+            {"K": [[6e-306, 0, 900], [0, 1000, 600], [0, 0, 1]]},
+            r"focal lengths \(6e-306, 1000\) px are those of no lens",
+        ),
+        ({"K": [[1000, 0, 900], [0, 1e8, 600], [0, 0, 1]]}, r"focal lengths \(1000, 1e\+08\) px are those of no lens"),
         ({"K": [[1000, 0, 9000], [0, 1000, 600], [0, 0, 1]]}, "far outside the 1920 x 1208 image"),
         ({"K": [[1000, 0, np.nan], [0, 1000, 600], [0, 0, 1]]}, "finite"),
         ({"K": np.eye(2)}, "K must be 3 x 3"),
