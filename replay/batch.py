@@ -4,7 +4,6 @@ The folder of a batch holds NAME.pcgan.mcap for each log, results.parquet, and r
 when its output is whole, and what it was made of. A log is done if that is still the same.
 """
 
-import errno
 import fcntl
 import hashlib
 import json
@@ -26,14 +25,13 @@ from replay.interrupts import Interrupted, Interrupts
 from replay.log_reader import checksum
 from replay.log_source import OUTPUT_ENDING, LogSource, UnreachableError, identity, local_copy
 from replay.log_writer import outputs as formats
-from replay.part_file import write_whole
+from replay.part_file import NO_LOCKS, write_whole
 from replay.record import Summary, record
 from replay.replay_job import ReplayJob, run_job
 from replay.session import PredictorChoice, Replay, ReplaySettings
 from replay.workers import Failure, failure_of
 
 RESULTS, ROWS, COPIES, LOCK = "results.parquet", "rows", ".batch.copies", ".batch.lock"
-NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}  # some file systems of the network have none
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,6 @@ APART = (255, 255, 255)
 ALONE = (255, 90, 150)
 FIGURES = {"figures/tracks": ("tracks apart, m", COLOURS["b"]), "figures/paths": ("likeliest paths apart, m", APART)}
 DISC_M = 0.1  # height of a person: higher ones lean outwards
-EYE_HEIGHT_M = 46.0
 LEAST_MARK_M = 0.01  # shorter lines could not be seen as lines
 FARTHEST_M = 1e9  # what lies beyond, or nowhere, is not drawn; the comparison tells of it
 LARGEST = 2**63 - 1  # stamp or sequence that rerun takes
@@ -287,19 +286,9 @@ def _layout() -> "rrb.Blueprint":
     """Returns the blueprint: both logs from above around the vehicle, how far they are apart, what the colours mean."""
     import rerun.blueprint as rrb
 
-    seen = rrb.Spatial3DView(
-        origin="/map/centre",
-        contents=["/map/**", "/a/**", "/b/**", "/apart/**"],
-        name="Both logs",
-        background=list(colours.BACKGROUND),
-        line_grid=False,
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=(0.0, -0.01, EYE_HEIGHT_M),  # not quite above: straight down leaves "up" open
-            look_target=(0.0, 0.0, 0.0),
-            eye_up=(0.0, 1.0, 0.0),
-        ),
-    )
+    from replay.rerun_layout import map_view
+
+    seen = map_view(["/map/**", "/a/**", "/b/**", "/apart/**"], "Both logs")
     figures = rrb.TimeSeriesView(
         origin="/figures",
         name="Largest distance of each frame",

@@ -90,13 +90,7 @@ class LogReader:
             now = _identity(path)
             if now == before:
                 continue
-            if (
-                now is not None
-                and before is not None
-                and self._salvage
-                and now[:2] == before[:2]
-                and now[2] > before[2]
-            ):
+            if self._salvage and now is not None and before is not None and now.grown_from(before):
                 note = f"{path.name}: it grew while it was read; what came later is left out"
                 if note not in self.losses.notes:
                     self.losses.notes.append(note)

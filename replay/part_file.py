@@ -13,7 +13,7 @@ try:
 except ImportError:  # not on Windows, where nobody can rename a file that is open
     fcntl = None  # type: ignore[assignment]
 
-_NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}  # some file systems of the network have none
+NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}  # some file systems of the network have none
 
 
 def part_of(path: Path) -> Path:
@@ -90,7 +90,7 @@ def _lock(number: int, part: Path) -> None:
             f"{part} is being written by another process; wait until it has ended, or choose another output"
         ) from None
     except OSError as error:
-        if error.errno not in _NO_LOCKS:
+        if error.errno not in NO_LOCKS:
             raise
 
 

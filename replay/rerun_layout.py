@@ -29,12 +29,12 @@ def layout(cameras: Mapping[str, tuple[int, int]]) -> rrb.Blueprint:
     )
     below = rrb.Horizontal(series, legend, column_shares=[1, 1])
     if not cameras:
-        body: rrb.Container = rrb.Horizontal(_map(), rrb.Vertical(series, legend), column_shares=[3, 1])
+        body: rrb.Container = rrb.Horizontal(map_view("/map/**"), rrb.Vertical(series, legend), column_shares=[3, 1])
     else:
         wanted = [name for row in ROWS for name in row if name in cameras]
         panes = wanted + sorted(cameras.keys() - set(CAMERAS))
         grid = rrb.Grid(*(_camera(name, *cameras[name]) for name in panes), grid_columns=min(3, len(panes)))
-        body = rrb.Horizontal(_map(), rrb.Vertical(grid, below, row_shares=[5, 4]), column_shares=[10, 11])
+        body = rrb.Horizontal(map_view("/map/**"), rrb.Vertical(grid, below, row_shares=[5, 4]), column_shares=[10, 11])
     return rrb.Blueprint(
         body,
         rrb.TimePanel(timeline="stamp", state="collapsed"),
@@ -43,15 +43,15 @@ def layout(cameras: Mapping[str, tuple[int, int]]) -> rrb.Blueprint:
     )
 
 
-def _map() -> rrb.Spatial3DView:
+def map_view(contents: str | list[str], name: str = "Map") -> rrb.Spatial3DView:
     """Returns a view from above that moves with the vehicle but keeps north up: its origin is `map/centre`.
 
     The eye's own `tracking_entity` does not follow in a view whose eye position is given (rerun 0.41).
     """
     return rrb.Spatial3DView(
         origin="/map/centre",
-        contents="/map/**",
-        name="Map",
+        contents=contents,
+        name=name,
         background=list(colours.BACKGROUND),
         line_grid=False,
         eye_controls=rrb.EyeControls3D(
